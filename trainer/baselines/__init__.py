@@ -1,0 +1,1 @@
+"""What the method is compared with, and what made the built-in demos."""

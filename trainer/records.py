@@ -1,0 +1,137 @@
+"""The records that move between the rooms. All frozen: what was measured does not change later.
+
+Shapes: N lanes (parallel episodes), T control steps, o = 11 observations, a = 3 actions,
+q = v = 6 positions and velocities. Arrays are lane-first, (N, T, ...).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Demo:
+    """The one demonstration video, resampled to a fixed frame rate."""
+
+    name: str
+    sha256: str
+    """Of the normalised video file, hex."""
+    path: Path
+    """The normalised video file."""
+    fps: float
+    """Frames per second."""
+    frames: int
+    """How many frames."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    task: str = ""
+    """The hand-coded reward that describes the move ("backflip", "hop"), or "" where none is known."""
+    source: str = ""
+    """What the video was made from: a file name or a command."""
+
+    @property
+    def seconds(self) -> float:
+        """Length of the video, in seconds."""
+        return self.frames / self.fps
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Segment:
+    """The part of a rollout behind a clip: W control steps of one lane."""
+
+    obs: np.ndarray
+    """Observation before each step, (W, o)."""
+    actions: np.ndarray
+    """Action of each step as the policy gave it (not clipped), (W, a)."""
+    qpos: np.ndarray
+    """Positions before each step, (W, q), metres and radians."""
+    qvel: np.ndarray
+    """Velocities before each step, (W, v), metres/s and radians/s."""
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.obs), len(self.actions), len(self.qpos), len(self.qvel)}
+        if len(lengths) != 1:
+            raise ValueError(f"a segment's arrays must have equal lengths, got {sorted(lengths)}")
+
+    def __len__(self) -> int:
+        return len(self.obs)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rollouts:
+    """What N lanes did in T control steps. Lane-first arrays; all states are those *before* the step."""
+
+    obs: np.ndarray
+    """Observations, (N, T, o), float64."""
+    actions: np.ndarray
+    """Actions as sampled (the environment clips them), (N, T, a), float32."""
+    qpos: np.ndarray
+    """Positions, (N, T, q), float64."""
+    qvel: np.ndarray
+    """Velocities, (N, T, v), float64."""
+    clock: np.ndarray
+    """Control steps since the episode began, (N, T), int32: the demo step that belongs to the state."""
+    inputs: np.ndarray
+    """Normalised policy inputs, (N, T, i), float32."""
+    next_inputs: np.ndarray
+    """Normalised policy inputs of the state after the step, before any reset, (N, T, i), float32."""
+    env_rewards: np.ndarray
+    """The environment's own reward of the step, (N, T). Never used by the method; baselines learn from it."""
+    terminated: np.ndarray
+    """True where the step reached a terminal state, (N, T), bool."""
+    truncated: np.ndarray
+    """True where the step reached the time limit, (N, T), bool."""
+
+    def segment(self, lane: int, start: int, length: int) -> Segment:
+        """Cuts steps ``start`` .. ``start + length`` of one lane.
+
+        Raises:
+            ValueError: If the cut leaves the rollout or spans the end of an episode.
+        """
+        stop = start + length
+        if not (0 <= start and stop <= self.obs.shape[1]):
+            raise ValueError(f"steps {start}..{stop} are outside 0..{self.obs.shape[1]}")
+        if self.clock[lane, stop - 1] - self.clock[lane, start] != length - 1:
+            raise ValueError(f"steps {start}..{stop} of lane {lane} span the end of an episode")
+        cut = (lane, slice(start, stop))
+        return Segment(
+            obs=self.obs[cut].copy(),
+            actions=self.actions[cut].copy(),
+            qpos=self.qpos[cut].copy(),
+            qvel=self.qvel[cut].copy(),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Clip:
+    """About 0.3 s of a rollout next to the demo frames of the same time span: what a person rates."""
+
+    id: int
+    run: str
+    demo_step: int
+    """Control step of the demo at which the clip begins."""
+    stage: str
+    """"pretrain" or "online"."""
+    iteration: int
+    """The iteration whose rollouts it was cut from; 0 in the pretrain stage."""
+    snapshot: int
+    """The newest snapshot when it was cut; 0 if there was none."""
+    predicted: float | None
+    """The rating that snapshot predicted, 1..5."""
+    steps: int
+    """Length, in control steps."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Rater:
+    """A person, or a simulated one."""
+
+    id: int
+    name: str
+    role: str
+    """"annotator", "researcher" or "simulated"."""
