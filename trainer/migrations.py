@@ -1,0 +1,121 @@
+"""The database schema, one step per version. A step, once released, never changes.
+
+``PRAGMA user_version`` holds the number of steps a database has seen.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+
+STEPS: tuple[str, ...] = (
+    # 1: people and their links; runs; clips with the segment behind each; append-only events.
+    """
+    CREATE TABLE raters (
+        id INTEGER PRIMARY KEY,
+        name TEXT NOT NULL UNIQUE,
+        role TEXT NOT NULL CHECK (role IN ('annotator', 'researcher', 'simulated')),
+        created_at TEXT NOT NULL
+    );
+    -- A link (in a URL) or a session (in a cookie). Only the SHA-256 of the token is stored.
+    CREATE TABLE tokens (
+        hash TEXT PRIMARY KEY,
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        kind TEXT NOT NULL CHECK (kind IN ('link', 'session')),
+        created_at TEXT NOT NULL,
+        revoked_at TEXT
+    );
+    CREATE TABLE runs (
+        id TEXT PRIMARY KEY,
+        demo TEXT NOT NULL,
+        demo_sha256 TEXT NOT NULL,
+        seed INTEGER NOT NULL,
+        config TEXT NOT NULL,           -- TOML, resolved
+        version TEXT NOT NULL,
+        created_at TEXT NOT NULL
+    );
+    CREATE TABLE clips (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        run TEXT NOT NULL REFERENCES runs (id),
+        demo_step INTEGER NOT NULL,     -- control step of the demo at which the clip begins
+        steps INTEGER NOT NULL,         -- length in control steps
+        stage TEXT NOT NULL CHECK (stage IN ('pretrain', 'online')),
+        iteration INTEGER NOT NULL,     -- whose rollouts it was cut from
+        snapshot INTEGER NOT NULL,      -- that made the prediction; 0: none
+        predicted REAL,                 -- 1..5
+        state TEXT NOT NULL DEFAULT 'cut' CHECK (state IN ('cut', 'ready', 'withdrawn')),
+        created_at TEXT NOT NULL
+    );
+    CREATE INDEX clips_by_run ON clips (run, state, id);
+    -- Observations, actions, qpos and qvel of the clip, as NPZ. A rating is worthless without them.
+    CREATE TABLE segments (
+        clip_id INTEGER PRIMARY KEY REFERENCES clips (id),
+        data BLOB NOT NULL
+    );
+    -- What raters did, append-only. The last event of a rater on a clip is the one that holds.
+    CREATE TABLE events (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        clip_id INTEGER NOT NULL REFERENCES clips (id),
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        kind TEXT NOT NULL CHECK (kind IN ('rate', 'undo', 'skip')),
+        value INTEGER CHECK (value BETWEEN 1 AND 5),
+        snapshot INTEGER NOT NULL,      -- newest prediction of the clip at that time
+        predicted REAL,
+        latency_ms INTEGER NOT NULL,    -- from the clip on screen to the press
+        created_at TEXT NOT NULL,
+        CHECK ((kind = 'rate') = (value IS NOT NULL))
+    );
+    CREATE INDEX events_by_clip ON events (clip_id, rater_id, id);
+    CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
+        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
+    CREATE TRIGGER events_keep_delete BEFORE DELETE ON events
+        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
+    CREATE TABLE snapshots (
+        run TEXT NOT NULL REFERENCES runs (id),
+        number INTEGER NOT NULL,
+        last_event INTEGER NOT NULL,    -- it was fitted on the ratings that held at this event
+        ratings INTEGER NOT NULL,
+        stats TEXT NOT NULL,            -- JSON
+        created_at TEXT NOT NULL,
+        PRIMARY KEY (run, number)
+    );
+    CREATE TABLE iterations (
+        run TEXT NOT NULL REFERENCES runs (id),
+        number INTEGER NOT NULL,
+        snapshot INTEGER NOT NULL,      -- that scored the whole iteration
+        env_steps INTEGER NOT NULL,     -- control steps so far
+        stats TEXT NOT NULL,            -- JSON
+        created_at TEXT NOT NULL,
+        PRIMARY KEY (run, number)
+    );
+    -- What other programs read: the ratings that hold, one row each.
+    CREATE VIEW ratings AS
+        SELECT e.id, e.clip_id, c.run, r.demo, p.name AS rater, e.value, c.stage, c.iteration,
+               e.created_at, e.latency_ms, e.snapshot, e.predicted, c.demo_step, c.steps
+        FROM events e
+        JOIN clips c ON c.id = e.clip_id
+        JOIN runs r ON r.id = c.run
+        JOIN raters p ON p.id = e.rater_id
+        WHERE e.kind = 'rate' AND NOT EXISTS (
+            SELECT 1 FROM events l
+            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
+        );
+    """,
+)
+
+
+def migrate(connection: sqlite3.Connection) -> None:
+    """Brings a database to the newest version, all steps or none of each.
+
+    Args:
+        connection: In autocommit mode.
+
+    Raises:
+        ValueError: If the database was made by a newer program.
+    """
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if version > len(STEPS):
+        raise ValueError(
+            f"schema version {version}, this program knows versions up to {len(STEPS)}"
+        )
+    for number, step in enumerate(STEPS[version:], start=version + 1):
+        connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")
