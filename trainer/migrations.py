@@ -114,8 +114,6 @@ def migrate(connection: sqlite3.Connection) -> None:
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
     if version > len(STEPS):
-        raise ValueError(
-            f"schema version {version}, this program knows versions up to {len(STEPS)}"
-        )
+        raise ValueError(f"schema version {version}, this program knows versions up to {len(STEPS)}")
     for number, step in enumerate(STEPS[version:], start=version + 1):
         connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")

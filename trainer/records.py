@@ -135,3 +135,33 @@ class Rater:
     name: str
     role: str
     """"annotator", "researcher" or "simulated"."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Status:
+    """What the trainer is doing, as of now; the page shows it."""
+
+    phase: str
+    """"starting", "pretrain", "online", "paused", "done", "stopped" or "failed"."""
+    message: str
+    """One plain sentence for people who do not know what a policy is."""
+    error: str = ""
+    """If it failed: what went wrong, one sentence."""
+    iteration: int = 0
+    """TRPO iterations so far."""
+    env_steps: int = 0
+    """Control steps so far."""
+    total_steps: int = 0
+    """Control steps at which the run is done."""
+    steps_per_s: float = 0.0
+    """Control steps per second in the last iteration."""
+    snapshot: int = 0
+    """Newest snapshot of the similarity predictor; 0 if there is none."""
+    ratings: int = 0
+    """Ratings that hold in this run."""
+    pretrain_ratings: int = 0
+    """Ratings asked for before the policy is trained."""
+    target_ratings: int = 0
+    """Ratings asked for in all."""
+    next_clips_s: float | None = None
+    """Seconds until new clips are expected, None if not known."""

@@ -69,9 +69,7 @@ class Store:
         self._lock = threading.RLock()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(
-                self.path, isolation_level=None, check_same_thread=False, timeout=10
-            )
+            self._db = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=10)
         except (OSError, sqlite3.Error) as error:
             raise UserError(
                 f"the data directory {data_dir} is not writable ({error}); choose another with --data-dir"
@@ -155,9 +153,7 @@ class Store:
 
     # Runs
 
-    def add_run(
-        self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str
-    ) -> None:
+    def add_run(self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str) -> None:
         """Records a new run.
 
         Raises:
@@ -206,16 +202,14 @@ class Store:
                         snapshot=clip.snapshot,
                         predicted=clip.predicted,
                         steps=len(clip.segment),
-                    )  # fmt: skip
+                    )
                 )
             return added
 
     def set_clip_state(self, clip_ids: Sequence[int], state: str) -> None:
         """Moves clips to "cut" (no picture yet), "ready" (may be shown) or "withdrawn" (too old)."""
         with self._transaction() as db:
-            db.executemany(
-                "UPDATE clips SET state = ? WHERE id = ?", [(state, i) for i in clip_ids]
-            )
+            db.executemany("UPDATE clips SET state = ? WHERE id = ?", [(state, i) for i in clip_ids])
 
     def set_predictions(self, snapshot: int, predicted: dict[int, float]) -> None:
         """Notes what a newer snapshot predicts for clips that wait to be rated."""
@@ -281,13 +275,9 @@ class Store:
         """
         return self._event(clip_id, rater_id, "undo", None, 0)
 
-    def _event(
-        self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int
-    ) -> int:
+    def _event(self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int) -> int:
         with self._transaction() as db:
-            clip = db.execute(
-                "SELECT snapshot, predicted FROM clips WHERE id = ?", (clip_id,)
-            ).fetchone()
+            clip = db.execute("SELECT snapshot, predicted FROM clips WHERE id = ?", (clip_id,)).fetchone()
             if clip is None:
                 raise ValueError(f"no clip {clip_id}")
             last = db.execute(
@@ -346,8 +336,7 @@ class Store:
     def ratings_of(self, run: str, rater_id: int) -> int:
         """How many ratings of one rater hold in a run."""
         return self._rows(
-            "SELECT COUNT(*) FROM ratings WHERE run = ? AND rater ="
-            " (SELECT name FROM raters WHERE id = ?)",
+            "SELECT COUNT(*) FROM ratings WHERE run = ? AND rater = (SELECT name FROM raters WHERE id = ?)",
             (run, rater_id),
         )[0][0]
 
@@ -356,8 +345,7 @@ class Store:
         db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
         try:
             yield from db.execute(
-                f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings"
-                " WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
+                f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
                 (run,),
             )
         finally:
@@ -365,9 +353,7 @@ class Store:
 
     # What the trainer did
 
-    def add_snapshot(
-        self, run: str, number: int, *, last_event: int, ratings: int, stats: dict
-    ) -> None:
+    def add_snapshot(self, run: str, number: int, *, last_event: int, ratings: int, stats: dict) -> None:
         """Records a snapshot whose file is on disk already."""
         with self._transaction() as db:
             db.execute(
@@ -381,14 +367,9 @@ class Store:
             "SELECT number, last_event, ratings, stats FROM snapshots WHERE run = ? ORDER BY number",
             (run,),
         )
-        return [
-            {"number": n, "last_event": e, "ratings": r, **json.loads(stats)}
-            for n, e, r, stats in rows
-        ]
+        return [{"number": n, "last_event": e, "ratings": r, **json.loads(stats)} for n, e, r, stats in rows]
 
-    def add_iteration(
-        self, run: str, number: int, *, snapshot: int, env_steps: int, stats: dict
-    ) -> None:
+    def add_iteration(self, run: str, number: int, *, snapshot: int, env_steps: int, stats: dict) -> None:
         """Records an iteration whose checkpoint is on disk already."""
         with self._transaction() as db:
             db.execute(
@@ -403,10 +384,7 @@ class Store:
             " WHERE run = ? AND number > ? ORDER BY number",
             (run, after),
         )
-        return [
-            {"number": n, "snapshot": s, "env_steps": e, **json.loads(stats)}
-            for n, s, e, stats in rows
-        ]
+        return [{"number": n, "snapshot": s, "env_steps": e, **json.loads(stats)} for n, s, e, stats in rows]
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
