@@ -1,0 +1,184 @@
+"""One tree of frozen dataclasses with defaults, units and sources; TOML in, TOML out.
+
+An unknown key is an error that names the nearest valid one. ``section.key=value`` overrides a file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+from trainer.errors import UserError
+from trainer.predictor import PredictorConfig
+from trainer.trpo import TrpoConfig
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RatingsConfig:
+    """What raters are asked. Defaults: the paper's section "Evaluation of learning from observations"."""
+
+    pretrain: int = 200
+    """Ratings of clips of a random policy, before the policy is trained."""
+    online: int = 150
+    """Ratings of clips of the policy in training."""
+    clip_seconds: float = 0.3
+    """Length of a clip."""
+    queue: int = 12
+    """Clips kept ready to be rated."""
+    stale_iterations: int = 10
+    """A clip that nobody has rated is withdrawn after so many iterations: the policy has moved on."""
+    online_share: float = 0.5
+    """A simulated rater gives its online ratings evenly over this first share of the training."""
+
+    def __post_init__(self) -> None:
+        _at_least(self, "ratings", pretrain=1, online=0, queue=1, stale_iterations=1)
+        if not 0.05 <= self.clip_seconds <= 5:
+            raise ValueError(f"ratings.clip_seconds must be 0.05 to 5 s, got {self.clip_seconds}")
+        if not 0 < self.online_share <= 1:
+            raise ValueError(f"ratings.online_share must be in (0, 1], got {self.online_share}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RolloutConfig:
+    """How the policy practises."""
+
+    lanes: int = 64
+    """Episodes that run side by side."""
+    steps: int = 250
+    """Control steps of each lane in one iteration."""
+    total_steps: int = 10_000_000
+    """Control steps, all lanes together, after which the run is done."""
+    threads: int = 2
+    """Threads of the physics."""
+
+    def __post_init__(self) -> None:
+        _at_least(self, "rollouts", lanes=1, steps=1, total_steps=1, threads=1)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RunConfig:
+    """Everything that decides a run, besides the ratings."""
+
+    seed: int = 0
+    """Of every random number in the run."""
+    env: str = "hopper"
+    """The robot: a name in the registry of ``trainer/envs.py``."""
+    encoder: str = "efficientnet-lite0"
+    """The frozen network that looks at the demo's frames."""
+    ratings: RatingsConfig = field(default_factory=RatingsConfig)
+    rollouts: RolloutConfig = field(default_factory=RolloutConfig)
+    predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+
+
+def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> RunConfig:
+    """The defaults, changed by a TOML file, changed by overrides.
+
+    Args:
+        path: TOML file, or None.
+        overrides: ``{"trpo.max_kl": 0.02}``: dotted key to value, as TOML would give it.
+
+    Raises:
+        UserError: If the file cannot be read, a key does not exist or a value does not fit.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        try:
+            tree = tomllib.loads(path.read_text())
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"cannot read the config file {path}: {error}") from None
+        except tomllib.TOMLDecodeError as error:
+            raise UserError(f"{path} is not valid TOML: {error}") from None
+    for dotted, value in (overrides or {}).items():
+        *sections, key = dotted.split(".")
+        branch = tree
+        for section in sections:
+            branch = branch.setdefault(section, {})
+            if not isinstance(branch, dict):
+                raise UserError(f"{dotted}: {section!r} is a value, not a section")
+        branch[key] = value
+    return _build(RunConfig, tree, "")
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """``"trpo.max_kl=0.02"`` as a dotted key and a TOML value; a bare word counts as a string.
+
+    Raises:
+        UserError: If there is no ``=``.
+    """
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise UserError(f"--set takes section.key=value, got {text!r}")
+    try:
+        return key.strip(), tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key.strip(), value.strip()
+
+
+def to_toml(config: Any) -> str:
+    """A config tree as TOML text that ``load_config`` reads back to the same tree."""
+    lines, sections = [], []
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            sections.append(f"\n[{entry.name}]\n{to_toml(value)}")
+        else:
+            lines.append(f"{entry.name} = {_toml_value(value)}\n")
+    return "".join(lines + sections)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    return repr(value)
+
+
+def _build(kind: type[T], tree: dict[str, Any], prefix: str) -> T:
+    hints = get_type_hints(kind)
+    known: dict[str, Any] = {}
+    for key, value in tree.items():
+        if key not in hints:
+            nearest = difflib.get_close_matches(key, list(hints), n=1, cutoff=0)
+            raise UserError(f"unknown key {prefix + key!r}; the nearest valid one is {prefix + nearest[0]!r}")
+        hint = hints[key]
+        if dataclasses.is_dataclass(hint):
+            if not isinstance(value, dict):
+                raise UserError(f"{prefix + key} is a section, not a value")
+            known[key] = _build(hint, value, f"{prefix}{key}.")  # type: ignore[arg-type]
+        else:
+            known[key] = _fit(prefix + key, value, hint)
+    try:
+        return kind(**known)
+    except ValueError as error:
+        raise UserError(str(error)) from None
+
+
+def _fit(key: str, value: Any, hint: Any) -> Any:
+    """The value in the type of the field; whole numbers are also numbers."""
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if hint in (int, float, str, bool):
+        if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
+            names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+            raise UserError(f"{key} must be {names[hint]}, got {value!r}")
+        return value
+    if isinstance(value, list):
+        return tuple(value)
+    return value
+
+
+def _at_least(config: Any, section: str, **minima: int) -> None:
+    for name, minimum in minima.items():
+        if getattr(config, name) < minimum:
+            raise ValueError(f"{section}.{name} must be at least {minimum}, got {getattr(config, name)}")
