@@ -1,0 +1,307 @@
+"""Pictures of the robot from stored positions, without a screen, and which frame shows which step.
+
+The robot alone is drawn by MuJoCo, at twice the size and then averaged down (smooth edges at a
+third of the price of multisampling); sky, floor and shadow come from ``trainer.backdrop``.
+The camera follows the robot along the track but keeps its height, so that a jump is seen as one;
+it rises only when the robot would leave the picture.
+
+Shapes: T pictures, q positions, H rows, W columns.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, TypeVar
+
+import cv2
+import gymnasium
+import mujoco
+import numpy as np
+
+from trainer.backdrop import Camera, backdrop
+from trainer.gl import open_context
+
+WIDTH, HEIGHT = 480, 360
+"""Size of one side of a clip, pixels."""
+
+HOPPER_XML = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
+
+_SCALE = 2
+# From the head down. Each limb its own colour: head and foot are told apart at any angle.
+_LIMB_COLOURS = ((0.91, 0.29, 0.17), (0.13, 0.25, 0.47), (0.20, 0.48, 0.76), (0.97, 0.69, 0.15))
+_FOVY = 45.0
+_CAMERA_HEIGHT = 1.02
+_FREE_ABOVE = 1.06  # the robot may rise this far above the camera before the camera follows
+
+T = TypeVar("T")
+
+
+def frame_of_step(step: int | np.ndarray, dt: float, fps: float, n_frames: int) -> np.ndarray:
+    """The frame on screen at a control step: ``floor(step * dt * fps)``, within the video.
+
+    Args:
+        step: Control step or steps, any shape.
+        dt: Seconds per control step.
+        fps: Frames per second.
+        n_frames: How many frames the video has.
+
+    Returns:
+        Frame indices in 0..n_frames - 1, the shape of ``step``, int64.
+    """
+    # A step that falls exactly on a frame must not miss it by a rounding error (0.008 * 125 * 30).
+    frame = np.floor(np.asarray(step) * (dt * fps) + 1e-9).astype(np.int64)
+    return np.clip(frame, 0, n_frames - 1)
+
+
+def steps_of_frames(n: int, dt: float, fps: float) -> np.ndarray:
+    """The control step that each of the first ``n`` frames shows: the nearest in time.
+
+    Args:
+        n: How many frames.
+        dt: Seconds per control step.
+        fps: Frames per second.
+
+    Returns:
+        Control steps, (n,), int64.
+    """
+    return np.floor(np.arange(n) / (fps * dt) + 0.5).astype(np.int64)
+
+
+class Renderer:
+    """Draws stored positions of one robot. Belongs to the thread that made it.
+
+    Args:
+        width: Pixels, even.
+        height: Pixels, even.
+        model_path: The robot's MJCF file; a planar robot with a plane for a floor.
+
+    Raises:
+        UserError: If this machine cannot draw without a screen, naming the missing package.
+    """
+
+    def __init__(
+        self, width: int = WIDTH, height: int = HEIGHT, *, model_path: str | Path = HOPPER_XML
+    ) -> None:
+        if width < 2 or height < 2 or width % 2 or height % 2:
+            raise ValueError(f"the picture's size must be even and positive, got {width}x{height}")
+        self.width, self.height = width, height
+        self._thread = threading.get_ident()
+        big = (height * _SCALE, width * _SCALE)
+        self._context: Any = open_context(big[1], big[0])
+        self._model = _studio_model(Path(model_path), width=big[1], height=big[0])
+        self._data = mujoco.MjData(self._model)
+        self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 16)
+        for flag in ("SHADOW", "REFLECTION", "SKYBOX", "FOG", "HAZE"):
+            self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
+        self._option = mujoco.MjvOption()
+        self._view = mujoco.MjvCamera()
+        self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+        self._view.fixedcamid = self._model.camera("track").id
+        self._distance = -float(self._model.camera("track").pos[1])
+        self._rect = mujoco.MjrRect(0, 0, big[1], big[0])
+        self._pixels = np.empty((*big, 3), np.uint8)
+
+    def render(self, qpos_Tq: np.ndarray) -> np.ndarray:
+        """Draws one picture per row of positions.
+
+        Args:
+            qpos_Tq: Positions, (T, q), metres and radians.
+
+        Returns:
+            Pictures, (T, H, W, 3), uint8 RGB.
+
+        Raises:
+            ValueError: If the shape is wrong or a position is not finite.
+            RuntimeError: If called from another thread or after ``close``.
+        """
+        if threading.get_ident() != self._thread:
+            raise RuntimeError("a Renderer draws only in the thread that made it: use RenderThread")
+        if self._context is None:
+            raise RuntimeError("this Renderer is closed")
+        qpos_Tq = np.asarray(qpos_Tq, np.float64)
+        if qpos_Tq.ndim != 2 or qpos_Tq.shape[1] != self._model.nq:
+            raise ValueError(f"positions must be (T, {self._model.nq}), got {qpos_Tq.shape}")
+        if not np.isfinite(qpos_Tq).all():
+            raise ValueError("positions must be finite")
+        self._context.make_current()
+        images = np.empty((len(qpos_Tq), self.height, self.width, 3), np.uint8)
+        for image, qpos in zip(images, qpos_Tq, strict=True):
+            self._draw(qpos, image)
+        return images
+
+    def close(self) -> None:
+        """Frees the GL context. Closing twice does nothing."""
+        if self._context is not None:
+            self._mjr.free()
+            self._context.free()
+            self._context = None
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _draw(self, qpos: np.ndarray, image: np.ndarray) -> None:
+        model, data = self._model, self._data
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        limbs_L4, top = _limbs(model, data)
+        camera = Camera(
+            x=float(data.subtree_com[0, 0]),
+            z=_CAMERA_HEIGHT + max(0.0, top - _CAMERA_HEIGHT - _FREE_ABOVE),
+            distance=self._distance,
+            fovy=_FOVY,
+        )
+        data.cam_xpos[self._view.fixedcamid] = (camera.x, -camera.distance, camera.z)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, self._option, None, self._view, everything, self._scene)
+        mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._mjr)
+        image[:] = backdrop(self.width, self.height, camera, limbs_L4)
+        _paste(image, self._pixels)
+
+
+class RenderThread:
+    """One renderer in a daemon thread of its own, for callers in any thread.
+
+    Args:
+        width: Pixels, even.
+        height: Pixels, even.
+
+    Raises:
+        UserError: If this machine cannot draw without a screen.
+    """
+
+    def __init__(self, width: int = WIDTH, height: int = HEIGHT) -> None:
+        self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[[Renderer], Any]] | None]
+        self._jobs = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._closed = False
+        started: Future[None] = Future()
+        self._thread = threading.Thread(
+            target=self._work, args=(width, height, started), name="render", daemon=True
+        )
+        self._thread.start()
+        started.result()
+
+    def submit(self, job: Callable[[Renderer], T]) -> Future[T]:
+        """Runs ``job(renderer)`` in the render thread, in the order of submission.
+
+        Args:
+            job: Called with the thread's renderer.
+
+        Returns:
+            The future of what ``job`` returns or raises.
+
+        Raises:
+            RuntimeError: If the thread is closed.
+        """
+        future: Future[T] = Future()
+        with self._lock:
+            if self._closed:
+                raise RuntimeError("the render thread is closed")
+            self._jobs.put((future, job))
+        return future
+
+    def render(self, qpos_Tq: np.ndarray) -> Future[np.ndarray]:
+        """The future of ``Renderer.render(qpos_Tq)``."""
+        return self.submit(lambda renderer: renderer.render(qpos_Tq))
+
+    def close(self) -> None:
+        """Ends the thread after the job in hand; jobs still waiting are cancelled."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                self._jobs.put(None)
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def __enter__(self) -> RenderThread:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _work(self, width: int, height: int, started: Future[None]) -> None:
+        try:
+            renderer = Renderer(width, height)
+        except BaseException as error:
+            started.set_exception(error)
+            return
+        started.set_result(None)
+        with renderer:
+            while (entry := self._jobs.get()) is not None:
+                future, job = entry
+                if self._closed:
+                    future.cancel()
+                elif future.set_running_or_notify_cancel():
+                    try:
+                        future.set_result(job(renderer))
+                    except BaseException as error:
+                        future.set_exception(error)
+
+
+def _studio_model(path: Path, *, width: int, height: int) -> mujoco.MjModel:
+    """The robot alone, in flat strong colours under a soft light; physics is left as it is."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+    spec.visual.quality.offsamples = 0
+    spec.visual.quality.numslices = 40
+    spec.visual.headlight.ambient = [0.46] * 3
+    spec.visual.headlight.diffuse = [0.26] * 3
+    spec.visual.headlight.specular = [0.0] * 3
+    spec.camera("track").fovy = _FOVY
+    for light in spec.lights:
+        light.dir = [0.35, 0.55, -1.0]
+        light.diffuse, light.ambient, light.specular = [0.5] * 3, [0.0] * 3, [0.22] * 3
+    limb = 0
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.rgba = [0, 0, 0, 0]  # the floor is drawn by the backdrop
+        else:
+            geom.material = ""
+            geom.rgba = [*_LIMB_COLOURS[limb % len(_LIMB_COLOURS)], 1]
+            limb += 1
+    return spec.compile()
+
+
+def _limbs(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
+    """Per capsule (x low, x high, z low, radius), (L, 4), and the top of the whole, metres."""
+    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
+    radius = model.geom_size[solid, 0]
+    axis = data.geom_xmat[solid].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[solid, 1:2]
+    reach = np.abs(axis) + radius[:, None]
+    low, high = data.geom_xpos[solid] - reach, data.geom_xpos[solid] + reach
+    return np.stack([low[:, 0], high[:, 0], low[:, 2], radius], 1), float(high[:, 2].max())
+
+
+def _paste(image: np.ndarray, pixels: np.ndarray) -> None:
+    """Lays the robot over the backdrop, in place; black, the clear colour, is see-through.
+
+    Args:
+        image: The backdrop, (H, W, 3), uint8.
+        pixels: The robot on black, bottom row first, (2H, 2W, 3), uint8.
+    """
+    solid = cv2.bitwise_not(cv2.inRange(pixels, (0, 0, 0), (0, 0, 0)))
+    x, y, w, h = cv2.boundingRect(solid)
+    if not w:
+        return
+    # Cut to the robot, on even borders, before the arithmetic: it covers a tenth of the picture.
+    x0, y0 = x // _SCALE, y // _SCALE
+    x1, y1 = -(-(x + w) // _SCALE), -(-(y + h) // _SCALE)
+    cut = (slice(y0 * _SCALE, y1 * _SCALE), slice(x0 * _SCALE, x1 * _SCALE))
+    size = (x1 - x0, y1 - y0)
+    robot = cv2.resize(pixels[cut], size, interpolation=cv2.INTER_AREA)[::-1]
+    cover = cv2.resize(solid[cut], size, interpolation=cv2.INTER_AREA)[::-1, :, None]
+    rows = slice(image.shape[0] - y1, image.shape[0] - y0)
+    patch = image[rows, x0:x1]
+    image[rows, x0:x1] = robot + (patch * (255 - cover.astype(np.uint16)) // 255).astype(np.uint8)
