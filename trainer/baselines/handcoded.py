@@ -1,0 +1,221 @@
+"""The paper's first baseline: TRPO on a hand-coded reward. It also makes two of the demos.
+
+``python -m trainer.baselines.handcoded --task backflip --steps 3000000 --seed 2 --out PREFIX``
+writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
+``PREFIX.json`` (settings and the learning curve).
+
+Shapes: N lanes or episodes, T control steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from trainer import envs
+from trainer.errors import UserError
+from trainer.hidden import SUFFIX, HiddenStates, save_hidden
+from trainer.motion import TASK_REWARDS, clean_turns, net_turns, task_reward, until_fall
+from trainer.policy import Policy, PolicyConfig
+from trainer.rollouts import Collector, Episodes, evaluate
+from trainer.trpo import Trpo, TrpoConfig
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HandcodedConfig:
+    """One training on a hand-coded reward."""
+
+    task: str = "backflip"
+    """A key of ``motion.TASK_REWARDS``."""
+    steps: int = 3_000_000
+    """Control steps to collect, all lanes together."""
+    seed: int = 0
+    """Of everything random."""
+    lanes: int = 64
+    """Episodes side by side."""
+    batch: int = 500
+    """Control steps of each lane in an iteration."""
+    horizon: int = 1000
+    """Control steps in an episode: 8 s."""
+    evaluate_every: int = 10
+    """Iterations between evaluations (16 deterministic episodes)."""
+    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="raw"))
+    """Sees the observation alone: the rewards say nothing about time."""
+    trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    """The step."""
+
+    def __post_init__(self) -> None:
+        if self.task not in TASK_REWARDS:
+            choices = ", ".join(sorted(TASK_REWARDS))
+            raise UserError(f"unknown task {self.task!r}; choose one of: {choices}")
+        for name in ("steps", "lanes", "batch", "horizon", "evaluate_every"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Score:
+    """An evaluation: 16 deterministic episodes."""
+
+    steps: int
+    """Control steps learned from so far."""
+    seconds: float
+    """Wall time so far."""
+    reward_mean: float
+    """Hand-coded reward of an episode."""
+    reward_max: float
+    """Of the best episode."""
+    net_turns_mean: float
+    """Backward turns of an episode."""
+    clean_turns_mean: float
+    """Backward turns of an episode on the foot alone."""
+    upright_seconds: float
+    """Mean time until the stock Hopper-v5 would have fallen."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HandcodedResult:
+    """What a training gave. "Best" is the policy with the highest mean reward."""
+
+    config: HandcodedConfig
+    curve: tuple[Score, ...]
+    """Evaluations, the last one of the final policy."""
+    final: Policy
+    best: Policy
+    best_score: Score
+    episode: HiddenStates
+    """The episode with the highest reward of the best policy."""
+
+
+def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> HandcodedResult:
+    """Trains a policy on a hand-coded reward.
+
+    Args:
+        config: The training.
+        progress: Show a progress bar on standard error.
+
+    Returns:
+        Policies, learning curve and the best episode.
+    """
+    # Hopping is learned as in Hopper-v5, where a fall ends the episode; a flip is no fall.
+    env = envs.make(
+        "hopper",
+        config.lanes,
+        horizon=config.horizon,
+        terminate_when_unhealthy=config.task == "hop",
+    )
+    policy = Policy(
+        config.policy,
+        obs_size=env.env_spec.obs_size,
+        action_size=env.env_spec.action_size,
+        horizon=config.horizon,
+        seed=config.seed,
+    )
+    trpo = Trpo(policy, config.trpo, seed=config.seed)
+    collector = Collector(env, seed=config.seed)
+    reward = TASK_REWARDS[config.task]
+    per_iteration = config.lanes * config.batch
+    iterations = -(-config.steps // per_iteration)
+    started = time.monotonic()
+    curve: list[Score] = []
+    best: tuple[Score, dict, HiddenStates] | None = None
+    with tqdm(total=iterations * per_iteration, unit="step", disable=not progress) as bar:
+        for iteration in range(1, iterations + 1):
+            batch = collector.collect(policy.snapshot(), config.batch)
+            rewards = reward(batch.next_obs, batch.actions, batch.qpos, batch.next_qpos, batch.next_qvel)
+            stats = trpo.update(batch, rewards)
+            bar.update(per_iteration)
+            if iteration % config.evaluate_every == 0 or iteration == iterations:
+                episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)
+                steps, seconds = iteration * per_iteration, time.monotonic() - started
+                score, episode = _judge(config.task, episodes, steps, seconds)
+                curve.append(score)
+                if best is None or score.reward_mean > best[0].reward_mean:
+                    best = score, policy.to_dict(), episode
+                bar.set_postfix(
+                    reward=round(score.reward_mean),
+                    best=round(score.reward_max),
+                    turns=round(score.net_turns_mean, 1),
+                    upright=round(score.upright_seconds, 1),
+                    kl=round(stats.kl, 3),
+                    explained=round(stats.explained_variance, 2),
+                    std=round(stats.std, 2),
+                )
+    env.close()
+    assert best is not None
+    return HandcodedResult(
+        config=config,
+        curve=tuple(curve),
+        final=policy,
+        best=Policy.from_dict(best[1]),
+        best_score=best[0],
+        episode=best[2],
+    )
+
+
+def save_result(prefix: Path, result: HandcodedResult) -> None:
+    """Writes ``<prefix>.hidden.npz``, ``<prefix>.policy.pt`` and ``<prefix>.json``."""
+    save_hidden(prefix.with_name(prefix.name + SUFFIX), result.episode)
+    torch.save(result.best.to_dict(), prefix.with_name(prefix.name + ".policy.pt"))
+    report = {
+        "config": asdict(result.config),
+        "best": asdict(result.best_score),
+        "curve": [asdict(score) for score in result.curve],
+    }
+    prefix.with_name(prefix.name + ".json").write_text(json.dumps(report, indent=2) + "\n")
+
+
+def _judge(task: str, episodes: Episodes, steps: int, seconds: float) -> tuple[Score, HiddenStates]:
+    rewards_NT = task_reward(task, episodes.obs, episodes.actions, episodes.qpos, episodes.qvel)
+    upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:])
+    if task == "hop":  # the stock episode ends at the fall
+        rewards_NT = rewards_NT * upright_NT
+    totals_N = rewards_NT.sum(1)
+    lane = int(totals_N.argmax())
+    score = Score(
+        steps=steps,
+        seconds=round(seconds, 1),
+        reward_mean=float(totals_N.mean()),
+        reward_max=float(totals_N.max()),
+        net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
+        clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
+        upright_seconds=float(upright_NT.sum(1).mean() * envs.spec("hopper").dt),
+    )
+    return score, HiddenStates(
+        obs=episodes.obs[lane],
+        actions=episodes.actions[lane],
+        qpos=episodes.qpos[lane],
+        qvel=episodes.qvel[lane],
+    )
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line; ``--help`` lists the options."""
+    parser = argparse.ArgumentParser(description="TRPO on a hand-coded reward.")
+    parser.add_argument("--task", choices=sorted(TASK_REWARDS), default="backflip")
+    parser.add_argument("--steps", type=int, default=3_000_000, help="control steps")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="prefix of the files to write")
+    parser.add_argument("--max-kl", type=float, default=TrpoConfig().max_kl, help="nats")
+    parser.add_argument("--gamma", type=float, default=TrpoConfig().gamma)
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)  # these networks are too small to gain from more
+    config = HandcodedConfig(
+        task=args.task,
+        steps=args.steps,
+        seed=args.seed,
+        trpo=TrpoConfig(max_kl=args.max_kl, gamma=args.gamma),
+    )
+    result = train_handcoded(config)
+    save_result(args.out, result)
+    print(json.dumps(asdict(result.best_score)))
+
+
+if __name__ == "__main__":
+    main()

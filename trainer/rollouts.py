@@ -1,0 +1,311 @@
+"""Collecting what the policy does: batches for learning, whole episodes for evaluation.
+
+``Collector`` keeps its lanes running between iterations, so a batch may be shorter than an
+episode. ``EpisodeRules`` says how episodes start, how the demo clock moves and when an episode
+ends early; the class itself is the plain case, and the trainer's loop subclasses it.
+
+Shapes: N lanes, T control steps, o observations, a actions, q = v positions and velocities,
+f policy inputs, K lanes that restart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from trainer import envs
+from trainer.policy import PolicySnapshot
+from trainer.records import Rollouts
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Transitions(Rollouts):
+    """Rollouts with the states *after* each step too, as they were before any reset."""
+
+    next_obs: np.ndarray
+    """Observations after the step, (N, T, o), float64."""
+    next_qpos: np.ndarray
+    """Positions after the step, (N, T, q), float64."""
+    next_qvel: np.ndarray
+    """Velocities after the step, (N, T, v), float64."""
+    next_clock: np.ndarray
+    """Demo step after the step, (N, T), int32: clock + 1 unless the rules say otherwise."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Episodes:
+    """N whole episodes, with the state after the last step: all states are (N, T + 1, ...)."""
+
+    obs: np.ndarray
+    """(N, T + 1, o)."""
+    actions: np.ndarray
+    """(N, T, a)."""
+    qpos: np.ndarray
+    """(N, T + 1, q)."""
+    qvel: np.ndarray
+    """(N, T + 1, v)."""
+    clock: np.ndarray
+    """Demo step of each state, (N, T + 1)."""
+    env_rewards: np.ndarray
+    """The environment's own reward of each step, (N, T)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Step:
+    """One control step of all lanes, as the rules see it."""
+
+    obs: np.ndarray
+    """Before the step, (N, o)."""
+    actions: np.ndarray
+    """As sampled, (N, a)."""
+    clock: np.ndarray
+    """Demo step before the step, (N,)."""
+    elapsed: np.ndarray
+    """Control steps since the episode began, this one included, (N,)."""
+    next_obs: np.ndarray
+    """After the step, before any reset, (N, o)."""
+    next_qpos: np.ndarray
+    """(N, q)."""
+    next_qvel: np.ndarray
+    """(N, v)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Starts:
+    """Where some restarting lanes begin instead of standing at demo step 0."""
+
+    lanes: np.ndarray
+    """Which, (K,), lane numbers."""
+    qpos: np.ndarray
+    """(K, q)."""
+    qvel: np.ndarray
+    """(K, v)."""
+    clock: np.ndarray
+    """Demo step that the state belongs to, (K,)."""
+
+
+class EpisodeRules:
+    """The plain rules: a standing start, one demo step per control step, no early end."""
+
+    def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:
+        """Called when lanes restart; None leaves them all in the standard reset.
+
+        Args:
+            lanes: The lanes that restart, (K,).
+            rng: The collector's generator: use no other, or a resumed run differs.
+        """
+        return None
+
+    def advance(self, step: Step) -> np.ndarray:
+        """The demo step after a control step, (N,). The episode ends once it is the horizon."""
+        return step.clock + 1
+
+    def stop(self, step: Step, next_clock: np.ndarray) -> np.ndarray:
+        """True where the episode is given up, as a terminal state, (N,)."""
+        return np.zeros(len(step.clock), bool)
+
+
+class Collector:
+    """Steps a batched environment with a policy, batch after batch.
+
+    Args:
+        env: The lanes.
+        seed: Of the resets and of the action noise.
+        rules: How episodes start, advance and end.
+        stagger: Shorten each lane's first episode differently, so that later batches see every
+            part of an episode.
+    """
+
+    def __init__(
+        self,
+        env: envs.HopperVectorEnv,
+        *,
+        seed: int,
+        rules: EpisodeRules | None = None,
+        stagger: bool = True,
+    ) -> None:
+        self.env = env
+        self.rules = rules or EpisodeRules()
+        self._rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
+        self._obs, _ = env.reset(seed=seed, options={"stagger": stagger})
+        self._clock = np.zeros(env.num_envs, np.int32)
+        self._begin(np.arange(env.num_envs))
+
+    def collect(self, policy: PolicySnapshot, steps: int, *, deterministic: bool = False) -> Transitions:
+        """Goes on for T control steps in every lane.
+
+        Args:
+            policy: Acts; one snapshot for the whole batch.
+            steps: T.
+            deterministic: Take the mean action instead of a sample.
+
+        Returns:
+            What happened, lane-first.
+        """
+        lanes, size = self.env.num_envs, self.env.env_spec
+        nq, nv = self.env.model.nq, self.env.model.nv
+        batch = {
+            "obs": np.empty((lanes, steps, size.obs_size)),
+            "actions": np.empty((lanes, steps, size.action_size), np.float32),
+            "qpos": np.empty((lanes, steps, nq)),
+            "qvel": np.empty((lanes, steps, nv)),
+            "clock": np.empty((lanes, steps), np.int32),
+            "inputs": np.empty((lanes, steps, len(policy.mean)), np.float32),
+            "env_rewards": np.empty((lanes, steps)),
+            "terminated": np.empty((lanes, steps), bool),
+            "truncated": np.empty((lanes, steps), bool),
+            "next_obs": np.empty((lanes, steps, size.obs_size)),
+            "next_qpos": np.empty((lanes, steps, nq)),
+            "next_qvel": np.empty((lanes, steps, nv)),
+            "next_clock": np.empty((lanes, steps), np.int32),
+        }
+        for t in range(steps):
+            row = self._step(policy, None if deterministic else self._rng)
+            for name, value in row.items():
+                batch[name][:, t] = value
+        next_inputs = policy.inputs(batch["next_obs"], batch["next_clock"])
+        return Transitions(next_inputs=next_inputs, **batch)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything a resumed training needs, as tensors and plain numbers."""
+        env = {
+            key: torch.from_numpy(value) if isinstance(value, np.ndarray) else value
+            for key, value in self.env.state_dict().items()
+        }
+        return {
+            "env": env,
+            "clock": torch.from_numpy(self._clock.copy()),
+            "rng": self._rng.bit_generator.state,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where ``state_dict`` was taken.
+
+        Raises:
+            ValueError: If the state is of another number of lanes or another robot.
+        """
+        self.env.load_state_dict(state["env"])
+        self._clock = np.array(state["clock"], np.int32)
+        self._rng.bit_generator.state = state["rng"]
+        self._obs = self.env.obs
+
+    def _step(self, policy: PolicySnapshot, rng: np.random.Generator | None) -> dict[str, np.ndarray]:
+        env, obs, clock = self.env, self._obs, self._clock
+        qpos, qvel = env.qpos, env.qvel
+        inputs = policy.inputs(obs, clock)
+        actions = policy.act(inputs, rng)
+        elapsed = env.elapsed + 1
+        self._obs, env_rewards, terminated, truncated, infos = env.step(actions)
+        step = Step(
+            obs=obs,
+            actions=actions,
+            clock=clock,
+            elapsed=elapsed,
+            next_obs=infos.get("final_obs", self._obs),
+            next_qpos=infos["final_qpos"] if infos else env.qpos,
+            next_qvel=infos["final_qvel"] if infos else env.qvel,
+        )
+        next_clock = self.rules.advance(step).astype(np.int32)
+        already = terminated | truncated
+        terminated = terminated | (self.rules.stop(step, next_clock) & ~already)
+        truncated = (truncated | (next_clock >= env.horizon)) & ~terminated
+        ended = terminated | truncated
+        self._clock = np.where(ended, 0, next_clock).astype(np.int32)
+        if ended.any():
+            late = ended & ~already  # ended by the rules, not by the environment
+            if late.any():
+                env.reset(options={"reset_mask": late})
+            self._begin(np.flatnonzero(ended))
+        return {
+            "obs": obs,
+            "actions": actions,
+            "qpos": qpos,
+            "qvel": qvel,
+            "clock": clock,
+            "inputs": inputs,
+            "env_rewards": env_rewards,
+            "terminated": terminated,
+            "truncated": truncated,
+            "next_obs": step.next_obs,
+            "next_qpos": step.next_qpos,
+            "next_qvel": step.next_qvel,
+            "next_clock": next_clock,
+        }
+
+    def _begin(self, lanes: np.ndarray) -> None:
+        starts = self.rules.start(lanes, self._rng)
+        if starts is not None and len(starts.lanes):
+            self.env.set_states(starts.lanes, starts.qpos, starts.qvel, elapsed=starts.clock)
+            self._clock[starts.lanes] = starts.clock
+        self._obs = self.env.obs
+
+
+def evaluate(
+    policy: PolicySnapshot,
+    env_name: str,
+    *,
+    episodes: int = 16,
+    seed: int = 0,
+    horizon: int | None = None,
+    rules: EpisodeRules | None = None,
+    deterministic: bool = True,
+    nthread: int | None = None,
+) -> Episodes:
+    """Whole episodes from standing starts, the policy's mean action, nothing ends early.
+
+    Args:
+        policy: Acts.
+        env_name: A registered environment.
+        episodes: N.
+        seed: Of the starts (and of the noise, if not deterministic).
+        horizon: T; the policy's own horizon if None.
+        rules: Moves the demo clock; its starts and stops are not used. The clock stays at the
+            horizon once it gets there.
+        deterministic: Take the mean action.
+        nthread: Physics threads.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        UserError: If the environment is unknown.
+    """
+    horizon = policy.horizon if horizon is None else horizon
+    rules = rules or EpisodeRules()
+    # One step more than asked, so that the last state is seen before the restart.
+    env = envs.make(env_name, episodes, horizon=horizon + 1, nthread=nthread)
+    rng = None if deterministic else np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
+    obs, _ = env.reset(seed=seed)
+    clock = np.zeros(episodes, np.int32)
+    states = [(obs, env.qpos, env.qvel, clock)]
+    actions, rewards = [], []
+    for t in range(horizon):
+        action = policy.act(policy.inputs(obs, clock), rng)
+        next_obs, reward, _, _, _ = env.step(action)
+        step = Step(
+            obs=obs,
+            actions=action,
+            clock=clock,
+            elapsed=np.full(episodes, t + 1, np.int32),
+            next_obs=next_obs,
+            next_qpos=env.qpos,
+            next_qvel=env.qvel,
+        )
+        clock = np.minimum(rules.advance(step), policy.horizon).astype(np.int32)
+        obs = next_obs
+        states.append((obs, step.next_qpos, step.next_qvel, clock))
+        actions.append(action)
+        rewards.append(reward)
+    env.close()
+    columns = [np.stack(column, axis=1) for column in zip(*states, strict=True)]
+    return Episodes(
+        obs=columns[0],
+        qpos=columns[1],
+        qvel=columns[2],
+        clock=columns[3],
+        actions=np.stack(actions, axis=1),
+        env_rewards=np.stack(rewards, axis=1),
+    )

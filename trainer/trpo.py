@@ -1,0 +1,353 @@
+"""Trust region policy optimisation (Schulman et al. 2015) with generalised advantages.
+
+One update: advantages from the value function, a natural-gradient direction by conjugate
+gradient on Fisher-vector products, a step as long as the trust region allows, a backtracking
+line search on the whole batch, then the value function's regression.
+
+The update does not depend on the scale of the rewards: advantages are standardised and the value
+function normalises its targets (``policy.ValueFunction``), so a learned reward may change scale.
+
+Shapes: N lanes, T steps, B = N T samples, f inputs, a actions, P policy parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
+
+from trainer.policy import Policy, ValueFunction
+from trainer.records import Rollouts
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrpoConfig:
+    """Trust-region step and value regression."""
+
+    max_kl: float = 0.05
+    """Trust-region radius, mean KL(old || new) over the batch, nats (FACTS: measured on backflips
+    from batches of 32 thousand steps; Schulman et al. 2015 use 0.01)."""
+    gamma: float = 0.99
+    """Discount per control step, in [0, 1)."""
+    lam: float = 0.97
+    """Bias-variance trade-off of the advantages, in [0, 1] (Schulman et al. 2016)."""
+    cg_iterations: int = 10
+    """Conjugate-gradient iterations (Schulman et al. 2015, appendix C)."""
+    damping: float = 0.1
+    """Added to the Fisher matrix's diagonal."""
+    backtracks: int = 10
+    """Tries of the line search."""
+    backtrack_factor: float = 0.8
+    """Each try is this times as long as the one before."""
+    fisher_samples: int = 8192
+    """Samples behind a Fisher-vector product (a subsample loses nothing: appendix C)."""
+    value_epochs: int = 5
+    """Passes of the value regression over the batch."""
+    value_rate: float = 1e-3
+    """Adam's step size in the value regression."""
+    value_batch: int = 2048
+    """Samples in a minibatch of the value regression."""
+    entropy_bonus: float = 0.0
+    """Added to the objective per nat of the policy's entropy, in standardised advantages."""
+
+    def __post_init__(self) -> None:
+        if self.max_kl <= 0:
+            raise ValueError(f"trpo.max_kl must be > 0 nats, got {self.max_kl}")
+        if not 0 <= self.gamma < 1:
+            raise ValueError(f"trpo.gamma must be in [0, 1), got {self.gamma}")
+        if not 0 <= self.lam <= 1:
+            raise ValueError(f"trpo.lam must be in [0, 1], got {self.lam}")
+        if self.damping < 0:
+            raise ValueError(f"trpo.damping must be >= 0, got {self.damping}")
+        if not 0 < self.backtrack_factor < 1:
+            raise ValueError(f"trpo.backtrack_factor must be between 0 and 1, got {self.backtrack_factor}")
+        counts = ("cg_iterations", "backtracks", "fisher_samples", "value_batch")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ValueError(f"trpo.{name} must be at least 1, got {getattr(self, name)}")
+        if self.value_epochs < 0 or self.value_rate <= 0:
+            raise ValueError("trpo.value_epochs must be >= 0 and trpo.value_rate > 0")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrpoStats:
+    """What one update did."""
+
+    accepted: bool
+    """Whether the line search found a step; if not, the policy is as before."""
+    backtracks: int
+    """How often the step was shortened."""
+    kl: float
+    """Mean KL(old || new) over the batch, nats."""
+    improvement: float
+    """Gain of the surrogate objective, in standard deviations of the advantage."""
+    explained_variance: float
+    """Of the returns by the value function before its fit: 1 is perfect, 0 a constant's."""
+    value_loss: float
+    """Mean squared error of the value function in its last epoch, in return deviations squared."""
+    entropy: float
+    """Of the policy after the step, nats."""
+    std: float
+    """Mean standard deviation of the actions after the step."""
+    mean_reward: float
+    """Of the batch, per step."""
+
+
+class Trpo:
+    """TRPO on one policy: owns the value function, its optimiser and its random numbers.
+
+    Args:
+        policy: Improved in place by ``update``.
+        config: The step.
+        seed: Of the value function's weights and of the subsamples.
+    """
+
+    def __init__(self, policy: Policy, config: TrpoConfig, *, seed: int) -> None:
+        self.policy = policy
+        self.config = config
+        self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed)
+        self._parameters = [*policy.mean.parameters(), policy.log_std]
+        self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def update(self, rollouts: Rollouts, rewards_NT: np.ndarray) -> TrpoStats:
+        """One TRPO step, then the value regression, then the policy's input normaliser.
+
+        Args:
+            rollouts: What the current policy did.
+            rewards_NT: Reward of each step, (N, T), any units.
+
+        Returns:
+            What the step did.
+
+        Raises:
+            ValueError: If the rewards have the wrong shape or are not finite.
+        """
+        if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
+            raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
+        inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1)
+        actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1)
+        with torch.no_grad():
+            values_NT = self.value(torch.from_numpy(rollouts.inputs)).numpy()
+            next_values_NT = self.value(torch.from_numpy(rollouts.next_inputs)).numpy()
+        advantages_NT = gae(
+            rewards_NT,
+            values_NT,
+            next_values_NT,
+            rollouts.terminated,
+            rollouts.terminated | rollouts.truncated,
+            gamma=self.config.gamma,
+            lam=self.config.lam,
+        )
+        returns_NT = advantages_NT + values_NT
+        spread = advantages_NT.std() + 1e-8
+        standard_NT = (advantages_NT - advantages_NT.mean()) / spread
+        advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten()
+        accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B)
+        returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten()
+        value_loss = self._fit_value(inputs_Bf, returns_B)
+        self.policy.observe(rollouts.obs, rollouts.clock)
+        log_std = self.policy.log_std.detach()
+        return TrpoStats(
+            accepted=accepted,
+            backtracks=backtracks,
+            kl=kl,
+            improvement=improvement,
+            explained_variance=float(1 - advantages_NT.var() / (returns_NT.var() + 1e-8)),
+            value_loss=value_loss,
+            entropy=float((log_std + 0.5 * np.log(2 * np.pi * np.e)).sum()),
+            std=float(log_std.exp().mean()),
+            mean_reward=float(rewards_NT.mean()),
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Value function, Adam and generator (the policy saves itself), for ``torch.save``."""
+        return {
+            "value": {name: x.detach().clone() for name, x in self.value.state_dict().items()},
+            "adam": self._adam.state_dict(),
+            "generator": self._generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where ``state_dict`` was taken."""
+        self.value.load_state_dict(state["value"])
+        self._adam.load_state_dict(state["adam"])
+        self._generator.set_state(state["generator"])
+
+    def _improve(
+        self, inputs_Bf: torch.Tensor, actions_Ba: torch.Tensor, advantages_B: torch.Tensor
+    ) -> tuple[bool, int, float, float]:
+        config, policy = self.config, self.policy
+        with torch.no_grad():
+            old_mean_Ba, old_log_std = policy(inputs_Bf), policy.log_std.clone()
+            old_log_prob_B = policy.log_prob(inputs_Bf, actions_Ba)
+
+        def objective() -> torch.Tensor:
+            ratio_B = torch.exp(policy.log_prob(inputs_Bf, actions_Ba) - old_log_prob_B)
+            return (ratio_B * advantages_B).mean() + config.entropy_bonus * policy.log_std.sum()
+
+        def divergence() -> torch.Tensor:
+            return mean_kl(old_mean_Ba, old_log_std, policy(inputs_Bf), policy.log_std)
+
+        before = objective()
+        gradient_P = _flat(torch.autograd.grad(before, self._parameters))
+        sample = torch.randperm(len(inputs_Bf), generator=self._generator)
+        sample = sample[: config.fisher_samples]
+        fisher = fisher_product(policy, inputs_Bf[sample], config.damping)
+        direction_P = conjugate_gradient(fisher, gradient_P, config.cg_iterations)
+        curvature = direction_P @ fisher(direction_P)
+        if not torch.isfinite(curvature) or curvature <= 0:  # no gradient: nothing to improve
+            return False, 0, 0.0, 0.0
+        step_P = direction_P * torch.sqrt(2 * config.max_kl / curvature)
+        old_P = parameters_to_vector(self._parameters).detach().clone()
+        with torch.no_grad():
+            for tries in range(config.backtracks):
+                step = config.backtrack_factor**tries * step_P
+                vector_to_parameters(old_P + step, self._parameters)
+                gain, kl = float(objective() - before), float(divergence())
+                if gain > 0 and kl <= config.max_kl:
+                    return True, tries, kl, gain
+            vector_to_parameters(old_P, self._parameters)
+        return False, config.backtracks, 0.0, 0.0
+
+    def _fit_value(self, inputs_Bf: torch.Tensor, returns_B: torch.Tensor) -> float:
+        targets_B = self.value.rescale(returns_B)
+        losses: list[float] = []
+        for _ in range(self.config.value_epochs):
+            order = torch.randperm(len(targets_B), generator=self._generator)
+            losses = []
+            for index in order.split(self.config.value_batch):
+                error = self.value.normalised(inputs_Bf[index]) - targets_B[index]
+                loss = error.square().mean()
+                self._adam.zero_grad()
+                loss.backward()
+                self._adam.step()
+                losses.append(loss.item())
+        return float(np.mean(losses)) if losses else float("nan")
+
+
+def gae(
+    rewards_NT: np.ndarray,
+    values_NT: np.ndarray,
+    next_values_NT: np.ndarray,
+    terminated_NT: np.ndarray,
+    ended_NT: np.ndarray,
+    *,
+    gamma: float,
+    lam: float,
+) -> np.ndarray:
+    """Advantage of each step (Schulman et al. 2016, eq. 16).
+
+    Only a terminal state cuts the bootstrap. At the time limit the sum over later steps stops,
+    but the value of the state that was reached still counts.
+
+    Args:
+        rewards_NT: Reward per step, (N, T).
+        values_NT: V of the state before each step, (N, T).
+        next_values_NT: V of the state after each step, before any reset, (N, T).
+        terminated_NT: True where the step reached a terminal state, (N, T).
+        ended_NT: True where the episode ended for any reason, (N, T).
+        gamma: Discount per control step, in [0, 1].
+        lam: Bias-variance trade-off, in [0, 1].
+
+    Returns:
+        Advantages, (N, T), float64, not normalised.
+
+    Raises:
+        ValueError: If the shapes disagree.
+    """
+    shapes = {x.shape for x in (rewards_NT, values_NT, next_values_NT, terminated_NT, ended_NT)}
+    if len(shapes) != 1:
+        raise ValueError(f"gae needs arrays of one shape (N, T), got {sorted(shapes)}")
+    deltas_NT = rewards_NT + gamma * next_values_NT * ~terminated_NT - values_NT
+    carry_NT = gamma * lam * ~ended_NT
+    advantages_NT = np.empty(rewards_NT.shape)
+    later_N = np.zeros(len(rewards_NT))
+    for t in range(rewards_NT.shape[1] - 1, -1, -1):
+        later_N = deltas_NT[:, t] + carry_NT[:, t] * later_N
+        advantages_NT[:, t] = later_N
+    return advantages_NT
+
+
+def conjugate_gradient(
+    product: Callable[[torch.Tensor], torch.Tensor],
+    b: torch.Tensor,
+    iterations: int,
+    tolerance: float = 1e-10,
+) -> torch.Tensor:
+    """Solves A x = b for a symmetric positive definite A (Hestenes and Stiefel 1952).
+
+    Args:
+        product: Multiplies a vector (P,) by A.
+        b: Right-hand side, (P,).
+        iterations: At most this many; P of them are exact but for rounding.
+        tolerance: Stop when the squared residual is below this.
+
+    Returns:
+        x, (P,).
+    """
+    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
+    square = residual @ residual
+    for _ in range(iterations):
+        if square < tolerance:
+            break
+        image = product(direction)
+        length = square / (direction @ image)
+        x += length * direction
+        residual -= length * image
+        square, previous = residual @ residual, square
+        direction = residual + square / previous * direction
+    return x
+
+
+def mean_kl(
+    old_mean_Ba: torch.Tensor,
+    old_log_std: torch.Tensor,
+    new_mean_Ba: torch.Tensor,
+    new_log_std: torch.Tensor,
+) -> torch.Tensor:
+    """Mean KL(old || new) of diagonal Gaussians, nats.
+
+    Args:
+        old_mean_Ba: (B, a).
+        old_log_std: (a,).
+        new_mean_Ba: (B, a).
+        new_log_std: (a,).
+    """
+    variance_ratio = torch.exp(2 * (old_log_std - new_log_std))
+    shift_Ba = (new_mean_Ba - old_mean_Ba) * torch.exp(-new_log_std)
+    kl_Ba = 0.5 * (variance_ratio + shift_Ba.square() - 1) + new_log_std - old_log_std
+    return kl_Ba.sum(-1).mean()
+
+
+def fisher_product(
+    policy: Policy, inputs_Bf: torch.Tensor, damping: float
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The function v -> (F + damping I) v, F the mean Fisher matrix of the policy at the inputs.
+
+    F is the Hessian of KL(policy now || policy) at the policy now, so the product is the gradient
+    of (gradient of the KL) . v (Schulman et al. 2015, appendix C).
+
+    Args:
+        policy: Not changed; its parameters at the time of the call count.
+        inputs_Bf: Normalised inputs, (B, f).
+        damping: Added to the diagonal.
+    """
+    parameters = [*policy.mean.parameters(), policy.log_std]
+    mean_Ba, log_std = policy(inputs_Bf), policy.log_std
+    kl = mean_kl(mean_Ba.detach(), log_std.detach(), mean_Ba, log_std)
+    slope_P = _flat(torch.autograd.grad(kl, parameters, create_graph=True))
+
+    def product(v_P: torch.Tensor) -> torch.Tensor:
+        grads = torch.autograd.grad(slope_P @ v_P, parameters, retain_graph=True)
+        return _flat(grads).detach() + damping * v_P
+
+    return product
+
+
+def _flat(tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:
+    return torch.cat([x.reshape(-1) for x in tensors])
