@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from trainer.errors import UserError
+from trainer.policy import PolicyConfig
 from trainer.predictor import PredictorConfig
 from trainer.trpo import TrpoConfig
 
@@ -55,7 +56,7 @@ class RolloutConfig:
     total_steps: int = 10_000_000
     """Control steps, all lanes together, after which the run is done."""
     threads: int = 2
-    """Threads of the physics."""
+    """Threads of the physics and of the networks. One thread gives the same numbers on any machine."""
 
     def __post_init__(self) -> None:
         _at_least(self, "rollouts", lanes=1, steps=1, total_steps=1, threads=1)
@@ -74,6 +75,7 @@ class RunConfig:
     ratings: RatingsConfig = field(default_factory=RatingsConfig)
     rollouts: RolloutConfig = field(default_factory=RolloutConfig)
     predictor: PredictorConfig = field(default_factory=PredictorConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
 
 

@@ -235,6 +235,10 @@ class Store:
         )
         return [Clip(**dict(zip(_CLIP.split(", "), row, strict=True))) for row in rows]
 
+    def count_clips(self, run: str) -> int:
+        """How many clips were ever cut in a run."""
+        return self._rows("SELECT COUNT(*) FROM clips WHERE run = ?", (run,))[0][0]
+
     def segment(self, clip_id: int) -> Segment:
         """The states and actions behind a clip.
 
@@ -297,13 +301,9 @@ class Store:
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
-    def last_event(self, run: str) -> int:
-        """Number of the newest event of a run, 0 if there is none."""
-        rows = self._rows(
-            "SELECT MAX(e.id) FROM events e JOIN clips c ON c.id = e.clip_id WHERE c.run = ?",
-            (run,),
-        )
-        return rows[0][0] or 0
+    def last_event(self) -> int:
+        """Number of the newest event of all runs, 0 if there is none."""
+        return self._rows("SELECT MAX(id) FROM events")[0][0] or 0
 
     def training_set(self, run: str, as_of: int | None = None) -> list[RatedSegment]:
         """The ratings of a run that held when event ``as_of`` was written (default: now), in order.

@@ -1,0 +1,78 @@
+"""Makes the pictures of clips: renders the robot, lays it beside the demo, writes one file per clip."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+
+import numpy as np
+
+from trainer.clips import compose_clip
+from trainer.files import write_atomic
+from trainer.records import Clip
+from trainer.render import Renderer, RenderThread
+from trainer.store import Store
+
+log = logging.getLogger(__name__)
+
+
+class ClipMaker:
+    """Turns clips of state "cut" into clips of state "ready", in the render thread.
+
+    Args:
+        store: Holds the segments; is told when a picture is there.
+        directory: Where the pictures go, ``<clip id>.webp``.
+        frames: The demo's frames, (F, H, W, 3), uint8.
+        fps: Frames per second of the demo.
+        frames_of: Demo frame at given control steps.
+        renderer: The thread that owns the GL context; not closed here.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        directory: Path,
+        *,
+        frames: np.ndarray,
+        fps: float,
+        frames_of: Callable[[np.ndarray], np.ndarray],
+        renderer: RenderThread,
+    ) -> None:
+        self._store = store
+        self._directory = directory
+        self._frames, self._fps, self._frames_of = frames, fps, frames_of
+        self._renderer = renderer
+
+    def file(self, clip_id: int) -> Path:
+        """Where the picture of a clip is, or will be."""
+        return self._directory / f"{clip_id:06d}.webp"
+
+    def slow_file(self, clip_id: int) -> Path:
+        """Where its slow-motion variant is, or will be."""
+        return self._directory / f"{clip_id:06d}.slow.webp"
+
+    def submit(self, clips: list[Clip]) -> list[Future[None]]:
+        """Queues clips; each becomes "ready" when its picture is on disk."""
+        return [self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip)) for clip in clips]
+
+    def recover(self, run: str) -> None:
+        """After a restart: queues what was cut but never drawn, and what lost its picture."""
+        lost = [c for c in self._store.waiting_clips(run) if not self.file(c.id).exists()]
+        self._store.set_clip_state([c.id for c in lost], "cut")
+        self.submit(self._store.waiting_clips(run, state="cut"))
+
+    def _make(self, renderer: Renderer, clip: Clip) -> None:
+        try:
+            segment = self._store.segment(clip.id)
+            index, first = np.unique(
+                self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True
+            )
+            agent = renderer.render(segment.qpos[first])
+            demo = self._frames[index]
+            write_atomic(self.file(clip.id), compose_clip(demo, agent, fps=self._fps))
+            self._store.set_clip_state([clip.id], "ready")
+        except Exception:
+            log.exception("clip %d could not be drawn", clip.id)
+            raise

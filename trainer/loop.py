@@ -1,0 +1,357 @@
+"""The trainer thread: pretrain, then refit, optimise and cut new clips, for as long as it is told.
+
+The way of one rating: it is in the database -> before the next iteration this thread sees a new event
+-> refit -> snapshot N on disk and in the database -> N scores the whole iteration -> TRPO step ->
+checkpoint -> new clips are cut from the newest rollouts. If anything fails, the error is in ``status``
+and clips of the last rollouts go on being cut, so that rating goes on.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import threading
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from trainer.choice import choose
+from trainer.clipmaker import ClipMaker
+from trainer.config import RunConfig
+from trainer.demos import read_frames
+from trainer.encoders import Encoder, demo_features
+from trainer.errors import UserError
+from trainer.files import write_atomic
+from trainer.learner import Learner
+from trainer.motion import TASK_REWARDS
+from trainer.policy import PolicySnapshot
+from trainer.predictor import Snapshot
+from trainer.records import Demo, Rater, Rollouts, Segment, Status
+from trainer.render import RenderThread
+from trainer.rollouts import Transitions
+from trainer.store import NewClip, Store
+
+log = logging.getLogger("onedemo")
+
+_TICK_S = 0.2
+"""How often the thread looks for ratings while it has nothing to compute."""
+_PRETRAIN_REFIT = 10
+"""New ratings between two refits while the policy is not trained yet."""
+
+
+class RatesClips:
+    """A rater that answers at once, in the trainer thread. People rate through the store instead."""
+
+    def __init__(self, rater: Rater, rate) -> None:  # type: ignore[no-untyped-def]
+        self.rater = rater
+        self.rate = rate
+
+
+class Trainer:
+    """One run: its thread, its files, its place in the database.
+
+    Args:
+        store: Shared with the page.
+        data_dir: ``runs/<run>/`` and the feature cache are in it.
+        run: Name of the run, recorded in the store already.
+        demo: What is to be learned.
+        config: The run's settings.
+        encoder: Looks at the demo's frames, once.
+        renderer: Draws clips for people; None if nobody looks.
+        simulated: Answers in place of people, with its name in the store; None for people.
+    """
+
+    def __init__(
+        self,
+        *,
+        store: Store,
+        data_dir: Path,
+        run: str,
+        demo: Demo,
+        config: RunConfig,
+        encoder: Encoder,
+        renderer: RenderThread | None = None,
+        simulated: RatesClips | None = None,
+    ) -> None:
+        self.store, self.run, self.demo, self.config = store, run, demo, config
+        self.data_dir = data_dir
+        self.directory = data_dir / "runs" / run
+        self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
+        self._learner: Learner | None = None
+        self._clips: ClipMaker | None = None
+        self._snapshot: Snapshot | None = None
+        self._fitted_event = 0
+        self._pool: Rollouts | None = None
+        self._policy: PolicySnapshot | None = None
+        self._stop, self._pause = threading.Event(), threading.Event()
+        self._retry = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._iteration_began = self._iteration_s = 0.0
+        self._status = Status(
+            phase="starting",
+            message="Looking at the demonstration for the first time.",
+            total_steps=config.rollouts.total_steps,
+            pretrain_ratings=config.ratings.pretrain,
+            target_ratings=config.ratings.pretrain + config.ratings.online,
+        )
+
+    # What other threads may call
+
+    def start(self) -> None:
+        """Starts the thread."""
+        self._thread = threading.Thread(target=self.work, name="trainer", daemon=True)
+        self._thread.start()
+
+    def pause(self) -> None:
+        """Ends optimisation after the iteration in hand; rating goes on."""
+        self._pause.set()
+
+    def resume(self) -> None:
+        """Goes on after ``pause``, and tries again after a failure."""
+        self._pause.clear()
+        self._retry.set()
+
+    def stop(self, timeout_s: float = 60.0) -> None:
+        """Ends the run's thread after the iteration in hand; the checkpoint stays."""
+        self._stop.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+
+    def status(self) -> Status:
+        """What the thread is doing, as of now."""
+        next_clips = None
+        if self._status.phase == "online" and self._iteration_s:
+            gone = time.monotonic() - self._iteration_began
+            next_clips = max(1.0, self._iteration_s - gone)
+        ratings = sum(self.store.ratings_by_class(self.run))
+        return replace(self._status, ratings=ratings, next_clips_s=next_clips)
+
+    def clip_file(self, clip_id: int) -> Path:
+        """The animated picture of a clip; it is there once the clip is "ready"."""
+        return self.directory / "clips" / f"{clip_id:06d}.webp"
+
+    def acting_policy(self) -> PolicySnapshot | None:
+        """The current policy, safe to use in any thread; None until there is one."""
+        return self._policy
+
+    # The thread
+
+    def work(self) -> None:
+        """Runs until done or stopped; a failure is shown in ``status`` and can be retried."""
+        while not self._stop.is_set():
+            try:
+                self._work()
+                return
+            except Exception as error:
+                log.exception("run %s: the trainer failed", self.run)
+                if self._simulated is not None:
+                    raise
+                self._rest_after(error)
+
+    def final_policy(self) -> tuple[Learner, Snapshot | None]:
+        """What was learned, for evaluation once the thread has ended."""
+        assert self._learner is not None, "the trainer has not run"
+        return self._learner, self._snapshot
+
+    def _work(self) -> None:
+        learner = self._prepare()
+        limit = self.config.rollouts.total_steps
+        while not self._stop.is_set():
+            self._ask(learner)
+            if learner.env_steps >= limit:
+                self._tell("done", "The agent has practised as long as it was told to.")
+                if self._simulated is not None:
+                    return
+                self._stop.wait(_TICK_S)
+            elif self._pause.is_set():
+                self._tell("paused", "Practice is paused. Ratings still count.")
+                self._stop.wait(_TICK_S)
+            elif learner.iteration == 0 and self._ratings() < self.config.ratings.pretrain:
+                self._tell("pretrain", "The robot moves at random until it has learned from your ratings.")
+                self._refit(learner, at_least=_PRETRAIN_REFIT)
+                self._stop.wait(_TICK_S)
+            else:
+                self._iterate(learner)
+        self._tell("stopped", "The run is stopped. It can be started again where it was.")
+
+    def _prepare(self) -> Learner:
+        torch.set_num_threads(self.config.rollouts.threads)
+        features = demo_features(self.demo, self._encoder, self.data_dir / "demos")
+        learner = Learner(self.config, features, self.demo.fps)
+        saved = self._load_checkpoint(learner)
+        self._learner = learner
+        self._policy = learner.policy()
+        self._pool = self._pool if saved and self._pool is not None else learner.random_rollouts()
+        self._load_snapshot()
+        if self._renderer is not None:
+            self._clips = ClipMaker(
+                self.store,
+                self.directory / "clips",
+                frames=read_frames(self.demo),
+                fps=self.demo.fps,
+                frames_of=learner.frames_of,
+                renderer=self._renderer,
+            )
+            self._clips.recover(self.run)
+        return learner
+
+    def _iterate(self, learner: Learner) -> None:
+        began = self._iteration_began = time.monotonic()
+        self._refit(learner, at_least=1)
+        snapshot = self._snapshot
+        assert snapshot is not None, "the policy is trained on a snapshot"
+        self._tell("online", "The robot is practising with what it learned from your ratings.")
+        before = learner.env_steps
+        rollouts, stats = learner.iterate(snapshot)
+        stats |= self._true_reward(rollouts)
+        self._iteration_s = time.monotonic() - began
+        stats["steps_per_s"] = (learner.env_steps - before) / self._iteration_s
+        self._pool, self._policy = rollouts, learner.policy()
+        row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
+        buffer = io.BytesIO()
+        torch.save({"learner": learner.state_dict(), "row": row}, buffer)
+        write_atomic(self.directory / "checkpoint.pt", buffer.getvalue())
+        self.store.add_iteration(self.run, learner.iteration, **row)
+        self._withdraw_stale(learner)
+        self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
+
+    def _refit(self, learner: Learner, at_least: int) -> None:
+        event = self.store.last_event()
+        if event == self._fitted_event or event - self._fitted_event < at_least:
+            return
+        ratings = self.store.training_set(self.run, as_of=event)
+        if not ratings:
+            return
+        number = (self._snapshot.number if self._snapshot else 0) + 1
+        snapshot, stats = learner.fit(ratings, number)
+        snapshot.save(self._snapshot_file(number))
+        self.store.add_snapshot(
+            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats)
+        )
+        self._snapshot, self._fitted_event = snapshot, event
+        waiting = self.store.waiting_clips(self.run)
+        predicted = {c.id: self._predict(self.store.segment(c.id), c.demo_step) for c in waiting}
+        self.store.set_predictions(number, {i: p for i, p in predicted.items() if p is not None})
+
+    def _ask(self, learner: Learner) -> None:
+        """Cuts as many clips as are missing from the queue, from the newest rollouts."""
+        assert self._pool is not None
+        given, missing = self._ratings(), 0
+        if self._simulated is not None:
+            missing = self._due(learner) - given
+        elif given < self._status.target_ratings:
+            stage_end = self._status.target_ratings
+            if learner.iteration == 0:
+                stage_end = self.config.ratings.pretrain
+            waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
+            missing = min(self.config.ratings.queue, stage_end - given) - len(waiting)
+        if missing <= 0:
+            return
+        # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
+        seed = [self.config.seed, learner.iteration, self.store.count_clips(self.run)]
+        questions = choose(
+            self._pool, missing, learner.clip_steps, learner.demo_steps, np.random.default_rng(seed)
+        )
+        new = []
+        for question in questions:
+            segment = self._pool.segment(question.lane, question.start, learner.clip_steps)
+            new.append(
+                NewClip(
+                    demo_step=question.demo_step,
+                    segment=segment,
+                    stage="pretrain" if learner.iteration == 0 else "online",
+                    iteration=learner.iteration,
+                    snapshot=self._snapshot.number if self._snapshot else 0,
+                    predicted=self._predict(segment, question.demo_step),
+                )
+            )
+        clips = self.store.add_clips(self.run, new)
+        if self._clips is not None:
+            self._clips.submit(clips)
+        if self._simulated is not None:
+            for clip, cut in zip(clips, new, strict=True):
+                value = self._simulated.rate(cut.segment, clip.demo_step)
+                self.store.rate(clip.id, self._simulated.rater.id, value, latency_ms=0)
+
+    def _due(self, learner: Learner) -> int:
+        """Ratings that a simulated rater has been asked for by now, in all."""
+        ratings = self.config.ratings
+        if learner.iteration == 0:
+            return ratings.pretrain
+        span = ratings.online_share * self.config.rollouts.total_steps
+        return ratings.pretrain + round(ratings.online * min(1.0, learner.env_steps / span))
+
+    def _withdraw_stale(self, learner: Learner) -> None:
+        oldest = learner.iteration - self.config.ratings.stale_iterations
+        stale = [c.id for c in self.store.waiting_clips(self.run) if c.iteration < oldest]
+        self.store.set_clip_state(stale, "withdrawn")
+
+    def _true_reward(self, rollouts: Transitions) -> dict[str, float]:
+        """The hand-coded reward where the demo's task has one: shown, never learned from."""
+        if self.demo.task not in TASK_REWARDS:
+            return {}
+        reward = TASK_REWARDS[self.demo.task](
+            rollouts.next_obs, rollouts.actions, rollouts.qpos, rollouts.next_qpos, rollouts.next_qvel
+        )
+        assert self._learner is not None
+        return {"true_reward": float(reward.mean() * self._learner.demo_steps)}
+
+    def _predict(self, segment: Segment, demo_step: int) -> float | None:
+        if self._snapshot is None or self._learner is None:
+            return None
+        return self._learner.predict(self._snapshot, segment, demo_step)
+
+    def _ratings(self) -> int:
+        return sum(self.store.ratings_by_class(self.run))
+
+    def _rest_after(self, error: Exception) -> None:
+        """Shows a failure and keeps cutting clips, until told to try again or to stop."""
+        reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        self._tell("failed", "The robot has stopped practising. Your ratings are kept, and still count.")
+        self._status = replace(self._status, error=reason)
+        self._retry.clear()
+        while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
+            try:
+                if self._learner is not None and self._pool is not None:
+                    self._ask(self._learner)
+            except Exception:
+                log.debug("run %s: still failing", self.run, exc_info=True)
+        self._status = replace(self._status, error="")
+
+    def _tell(self, phase: str, message: str, stats: dict | None = None) -> None:
+        learner = self._learner
+        self._status = replace(
+            self._status,
+            phase=phase,
+            message=message,
+            iteration=learner.iteration if learner else 0,
+            env_steps=learner.env_steps if learner else 0,
+            snapshot=self._snapshot.number if self._snapshot else 0,
+            steps_per_s=stats["steps_per_s"] if stats else self._status.steps_per_s,
+        )
+
+    # Files
+
+    def _snapshot_file(self, number: int) -> Path:
+        return self.directory / "snapshots" / f"{number:06d}.pt"
+
+    def _load_snapshot(self) -> None:
+        """The newest snapshot that the database knows and the disk holds."""
+        for row in reversed(self.store.snapshots(self.run)):
+            file = self._snapshot_file(row["number"])
+            if file.exists():
+                self._snapshot, self._fitted_event = Snapshot.load(file), row["last_event"]
+                return
+
+    def _load_checkpoint(self, learner: Learner) -> bool:
+        file = self.directory / "checkpoint.pt"
+        if not file.exists():
+            return False
+        saved = torch.load(file, weights_only=True)
+        learner.load_state_dict(saved["learner"])
+        # The process may have died between the file and the row.
+        self.store.add_iteration(self.run, learner.iteration, **saved["row"])
+        return True
