@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -327,7 +327,7 @@ def mlp(sizes: Sequence[int], last_gain: float, seed: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     for i, (fan_in, fan_out) in enumerate(itertools.pairwise(sizes)):
         last = i == len(sizes) - 2
-        layer = nn.utils.skip_init(nn.Linear, fan_in, fan_out)
+        layer = cast(nn.Linear, nn.utils.skip_init(nn.Linear, fan_in, fan_out))
         gain = last_gain if last else math.sqrt(2)
         nn.init.orthogonal_(layer.weight, gain, generator)
         nn.init.zeros_(layer.bias)

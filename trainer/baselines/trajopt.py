@@ -1,0 +1,226 @@
+"""Clean standing backflips with landings, by trajectory optimisation. It makes one of the demos.
+
+``python -m trainer.baselines.trajopt --flips 4 --seed 0 --out PREFIX`` writes
+``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
+1999) searches the next 0.6 s of motor commands for those that best keep a timetable of leaps, and
+the first part of the best plan is carried out. What reinforcement learning finds for the same
+move is tumbling over the ground; these flips are what a person would call a backflip.
+
+Shapes: N candidate plans, T control steps ahead, K knots of a plan, a actions, q = v positions
+and velocities.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from trainer import envs
+from trainer.errors import UserError
+from trainer.hidden import SUFFIX, HiddenStates, save_hidden
+from trainer.motion import backflip_reward, clean_turns, clearances, net_turns
+
+GRAVITY = 9.81
+STANDING = 1.22
+"""Torso height of a relaxed stance, metres."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FlipPlan:
+    """The timetable and the search."""
+
+    flips: int = 4
+    """How many flips are on the timetable."""
+    period: float = 1.9
+    """Seconds from one flip to the next."""
+    start: float = 0.6
+    """Seconds into its period at which a flip leaves the ground."""
+    roll: float = 0.6
+    """Seconds a flip takes."""
+    seconds: float = 8.0
+    """Length of the whole."""
+    samples: int = 96
+    """N: candidate plans per iteration of the search."""
+    elites: int = 12
+    """Best candidates that the next iteration's distribution is fitted to."""
+    iterations: int = 3
+    """Of the search, per knot."""
+    knots: int = 12
+    """K: a plan is this many constant commands."""
+    hold: int = 6
+    """Control steps that one command lasts."""
+    seed: int = 0
+    """Of the search."""
+
+    def __post_init__(self) -> None:
+        if min(self.flips, self.elites, self.iterations, self.knots, self.hold) < 1:
+            raise UserError("flips, elites, iterations, knots and hold must be at least 1")
+        if self.samples < self.elites:
+            raise UserError(f"samples ({self.samples}) must be at least elites ({self.elites})")
+        if not 0 < self.start + self.roll <= self.period or min(self.roll, self.seconds) <= 0:
+            raise UserError("a flip (start + roll) must fit into its period")
+
+
+def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
+    """Searches, step by step, for motor commands that keep the timetable.
+
+    Args:
+        plan: Timetable and search.
+        progress: Show a progress bar on standard error.
+
+    Returns:
+        The episode, from the standard reset.
+    """
+    ahead = plan.knots * plan.hold
+    env = envs.make("hopper", plan.samples, horizon=ahead + 1)
+    env.reset(seed=plan.seed)
+    rng = np.random.default_rng(plan.seed)
+    steps = round(plan.seconds / env.dt)
+    qpos, qvel = [env.qpos[0]], [env.qvel[0]]
+    actions: list[np.ndarray] = []
+    mean_Ka = np.zeros((plan.knots, env.env_spec.action_size))
+    with tqdm(total=steps, unit="step", disable=not progress) as bar:
+        while len(actions) < steps:
+            best_Ka, q_Tq, v_Tv = _search(plan, env, qpos[-1], qvel[-1], len(actions), mean_Ka, rng)
+            take = min(plan.hold, steps - len(actions))
+            actions += [best_Ka[0]] * take
+            qpos += list(q_Tq[:take])
+            qvel += list(v_Tv[:take])
+            mean_Ka = np.concatenate([best_Ka[1:], best_Ka[-1:]])
+            bar.update(take)
+            bar.set_postfix(turns=round(-qpos[-1][2] / (2 * np.pi), 2), z=round(qpos[-1][1], 2))
+    env.close()
+    states = np.array(qpos), np.array(qvel)
+    return HiddenStates(
+        obs=envs.observe(env.env_spec, *states),
+        actions=np.array(actions, np.float32),
+        qpos=states[0],
+        qvel=states[1],
+    )
+
+
+def timetable(plan: FlipPlan, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the torso should do at times t.
+
+    Args:
+        plan: The timetable.
+        t: Seconds since the start, any shape.
+
+    Returns:
+        Torso angle in radians, height in metres, and whether a flip is under way; shapes of t.
+    """
+    turn = np.floor(t / plan.period)
+    since = t - turn * plan.period - plan.start  # seconds since this period's take-off
+    phase = np.clip(since / plan.roll, 0, 1)
+    done = np.minimum(turn + phase, plan.flips)
+    flying = (since > 0) & (since < plan.roll) & (turn < plan.flips)
+    rise = GRAVITY / 2 * since * (plan.roll - since)  # a ballistic arc of that duration
+    # A full turn and a little: whole turns are counted rounded down.
+    lean = 0.05 * np.minimum(done, 1)
+    return -2 * np.pi * done - lean, np.where(flying, STANDING + rise, STANDING), flying
+
+
+def cost(plan: FlipPlan, qpos_NTq: np.ndarray, qvel_NTv: np.ndarray, t_T: np.ndarray) -> np.ndarray:
+    """How far candidate trajectories are from the timetable, mean over time, (N,)."""
+    angle, height, flying = timetable(plan, t_T)
+    x, z, torso, thigh, leg = (qpos_NTq[..., i] for i in range(5))
+    gaps = clearances(qpos_NTq)
+    lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
+    cost_NT = (
+        4 * np.minimum((torso - angle) ** 2, 4)
+        + 3 * (z - height) ** 2
+        + 0.05 * qvel_NTv[..., 0] ** 2
+        + 0.02 * x**2
+        + 20 * np.maximum(0, 0.2 - lowest)  # nothing but the foot near the ground
+        + ~flying * (0.03 * qvel_NTv[..., 2] ** 2 + 0.3 * (thigh + 0.3) ** 2 + 0.2 * (leg + 0.5) ** 2)
+    )
+    weight_T = np.ones(len(t_T))
+    weight_T[-6:] = 3  # where the plan leads matters more than how it gets there
+    return (cost_NT * weight_T).mean(1)
+
+
+def _search(
+    plan: FlipPlan,
+    env: envs.HopperVectorEnv,
+    qpos_q: np.ndarray,
+    qvel_v: np.ndarray,
+    step: int,
+    mean_Ka: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The best plan found from one state, with the states it leads through."""
+    t_T = (step + 1 + np.arange(plan.knots * plan.hold)) * env.dt
+    std_Ka = np.full_like(mean_Ka, 0.6)
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
+    for _ in range(plan.iterations):
+        noise = rng.standard_normal((plan.samples, *mean_Ka.shape))
+        plans_NKa = np.clip(mean_Ka + std_Ka * noise, -1, 1)
+        plans_NKa[0] = mean_Ka
+        if best is not None:
+            plans_NKa[1] = best[1]
+        qpos_NTq, qvel_NTv = _simulate(plan, env, qpos_q, qvel_v, plans_NKa)
+        costs_N = cost(plan, qpos_NTq, qvel_NTv, t_T) + 0.002 * np.square(plans_NKa).sum((1, 2))
+        order = np.argsort(costs_N)
+        first = order[0]
+        if best is None or costs_N[first] < best[0]:
+            best = float(costs_N[first]), plans_NKa[first], qpos_NTq[first], qvel_NTv[first]
+        elites = plans_NKa[order[: plan.elites]]
+        mean_Ka = 0.8 * elites.mean(0) + 0.2 * elites[0]
+        std_Ka = np.maximum(elites.std(0), 0.08)
+    assert best is not None
+    return best[1:]
+
+
+def _simulate(
+    plan: FlipPlan,
+    env: envs.HopperVectorEnv,
+    qpos_q: np.ndarray,
+    qvel_v: np.ndarray,
+    plans_NKa: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    lanes = np.arange(plan.samples)
+    tile = (plan.samples, 1)
+    env.set_states(lanes, np.tile(qpos_q, tile), np.tile(qvel_v, tile), elapsed=0 * lanes)
+    qpos, qvel = [], []
+    for k in range(plan.knots):
+        for _ in range(plan.hold):
+            env.step(plans_NKa[:, k])
+            qpos.append(env.qpos)
+            qvel.append(env.qvel)
+    return np.stack(qpos, 1), np.stack(qvel, 1)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line; ``--help`` lists the options."""
+    defaults = FlipPlan()
+    parser = argparse.ArgumentParser(description="Clean standing backflips by optimisation.")
+    parser.add_argument("--flips", type=int, default=defaults.flips)
+    parser.add_argument("--period", type=float, default=defaults.period, help="seconds")
+    parser.add_argument("--start", type=float, default=defaults.start, help="seconds")
+    parser.add_argument("--roll", type=float, default=defaults.roll, help="seconds")
+    parser.add_argument("--samples", type=int, default=defaults.samples)
+    parser.add_argument("--seed", type=int, default=defaults.seed)
+    parser.add_argument("--out", type=Path, required=True, help="prefix of the file to write")
+    args = parser.parse_args(argv)
+    options = {k: v for k, v in vars(args).items() if k != "out"}
+    hidden = optimise_flips(FlipPlan(**options))
+    save_hidden(args.out.with_name(args.out.name + SUFFIX), hidden)
+    gaps = clearances(hidden.qpos)
+    report = {
+        "net_turns": int(net_turns(hidden.qpos[:, 2])),
+        "clean_turns": int(clean_turns(hidden.qpos)),
+        "turns": float((hidden.qpos[0, 2] - hidden.qpos[-1, 2]) / (2 * np.pi)),
+        "backflip_reward": float(backflip_reward(hidden.obs[1:], hidden.actions).sum()),
+        "lowest_part_but_foot": float(min(gaps[part].min() for part in ("torso", "thigh", "leg"))),
+        "x": float(hidden.qpos[-1, 0]),
+    }
+    print(json.dumps(report))
+
+
+if __name__ == "__main__":
+    main()
