@@ -1,0 +1,192 @@
+"""The batched hopper against gymnasium's own, its resets and its saved state."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from trainer import envs
+from trainer.errors import UserError
+
+STEPS = 300
+
+
+def stock(**options):
+    return gymnasium.make("Hopper-v5", terminate_when_unhealthy=False, **options).unwrapped
+
+
+def actions_for(seed, lanes, steps, scale=1.5):
+    # Beyond the motors' range too: they clamp, the control cost does not.
+    return np.random.default_rng(seed).uniform(-scale, scale, (steps, lanes, 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_equals_gymnasium(seed):
+    """Observations and rewards of Hopper-v5, 300 steps, falling and tumbling included."""
+    env = envs.make("hopper", 5, nthread=2)
+    env.reset(seed=seed)
+    single = [stock() for _ in range(5)]
+    for lane, one in enumerate(single):
+        one.reset(seed=0)
+        one.set_state(env.qpos[lane], env.qvel[lane])
+    worst = 0.0
+    for action in actions_for(seed, 5, STEPS):
+        obs, rewards, *_ = env.step(action)
+        for lane, one in enumerate(single):
+            expected, reward, *_ = one.step(action[lane])
+            worst = max(worst, np.abs(obs[lane] - expected).max(), abs(rewards[lane] - reward))
+    assert worst < 1e-9
+    env.close()
+    assert (obs[:, 0] < 0.7).any(), "no hopper fell: the test saw no contact of other parts"
+
+
+def test_one_lane_starts_as_gymnasium_does():
+    env = envs.make("hopper", 1, nthread=0)
+    obs, _ = env.reset(seed=7)
+    expected, _ = stock().reset(seed=7)
+    np.testing.assert_array_equal(obs[0], expected)
+    one_step, *_ = env.step(np.zeros((1, 3), np.float32))
+    assert one_step.shape == (1, 11)
+
+
+def test_termination_is_the_stock_rule():
+    env = envs.make("hopper", 16, nthread=0, terminate_when_unhealthy=True)
+    env.reset(seed=0)
+    single = gymnasium.make("Hopper-v5").unwrapped
+    single.reset(seed=0)
+    falls = 0
+    for action in actions_for(0, 16, 60):
+        before = env.qpos, env.qvel
+        _, _, terminated, truncated, infos = env.step(action)
+        assert not truncated.any()
+        for lane in range(16):
+            single.set_state(before[0][lane], before[1][lane])
+            single.data.qacc_warmstart[:] = 0
+            expected, _, fell, _, _ = single.step(action[lane])
+            assert fell == terminated[lane]
+            if fell:
+                falls += 1
+                np.testing.assert_allclose(infos["final_obs"][lane], expected, atol=1e-9)
+                assert env.elapsed[lane] == 0
+                assert abs(env.qpos[lane, 1] - 1.25) < 0.01
+    assert falls > 5
+
+
+def test_time_limit_truncates_and_restarts_in_the_same_step():
+    env = envs.make("hopper", 3, horizon=4, nthread=0)
+    assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    env.reset(seed=0)
+    for t in range(1, 9):
+        obs, _, terminated, truncated, infos = env.step(np.ones((3, 3)))
+        assert not terminated.any()
+        assert truncated.all() == (t % 4 == 0)
+        assert ("final_obs" in infos) == (t % 4 == 0)
+    assert infos["_final_obs"].all()
+    assert np.abs(infos["final_obs"] - obs).max() > 0.05
+    assert (env.elapsed == 0).all()
+    np.testing.assert_array_equal(
+        infos["final_obs"],
+        envs.observe(env.env_spec, infos["final_qpos"], infos["final_qvel"]),
+    )
+
+
+def test_spaces_and_gymnasium_wrappers():
+    env = envs.make("hopper", 4, horizon=10, nthread=0)
+    wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
+    obs, _ = wrapped.reset(seed=1)
+    assert env.observation_space.contains(obs)
+    total = np.zeros(4)
+    for _ in range(10):
+        env.action_space.seed(0)
+        obs, rewards, *_, infos = wrapped.step(env.action_space.sample())
+        total += rewards
+    np.testing.assert_allclose(infos["episode"]["r"], total)
+    assert env.observation_space.contains(obs)
+    wrapped.close()
+
+
+def test_stagger_spreads_the_lanes_over_the_episode():
+    env = envs.make("hopper", 10, horizon=100, nthread=0)
+    env.reset(seed=0, options={"stagger": True})
+    assert (env.elapsed == 0).all()
+    ends = {}
+    for t in range(1, 201):
+        _, _, _, truncated, _ = env.step(np.zeros((10, 3)))
+        for lane in np.flatnonzero(truncated):
+            ends.setdefault(int(lane), []).append(t)
+    assert [ends[lane][0] for lane in range(10)] == list(range(100, 0, -10))
+    assert all(lane_ends[1] - lane_ends[0] == 100 for lane_ends in ends.values())
+
+
+def test_reset_mask_leaves_the_other_lanes_alone():
+    env = envs.make("hopper", 4, nthread=0)
+    env.reset(seed=0)
+    for action in actions_for(1, 4, 20):
+        env.step(action)
+    before = env.obs
+    mask = np.array([False, True, False, True])
+    after, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    assert (np.abs(after[mask] - before[mask]).max(1) > 0.01).all()
+    assert env.elapsed.tolist() == [20, 0, 20, 0]
+
+
+def test_set_states():
+    env = envs.make("hopper", 4, horizon=50, nthread=0)
+    env.reset(seed=0)
+    qpos = np.tile([0.5, 1.4, -2.0, -0.3, -0.5, 0.2], (2, 1))
+    qvel = np.tile([1.0, 2.0, -12.0, 0.0, 0.0, 0.0], (2, 1))
+    env.set_states(np.array([3, 1]), qpos, qvel, elapsed=np.array([49, 10]))
+    np.testing.assert_array_equal(env.qpos[[1, 3]], qpos)
+    np.testing.assert_array_equal(env.qvel[[1, 3]], qvel)
+    assert env.obs[1, 7] == -10, "observed velocities are clipped"
+    _, _, _, truncated, _ = env.step(np.zeros((4, 3)))
+    assert truncated.tolist() == [False, False, False, True]
+    with pytest.raises(ValueError, match="finite"):
+        env.set_states(np.array([0]), qpos[:1] * np.nan, qvel[:1])
+    with pytest.raises(ValueError, match="2 lanes"):
+        env.set_states(np.array([0, 1]), qpos[:1], qvel[:1])
+
+
+def test_saved_state_goes_on_exactly():
+    def run(env, first, last):
+        seen = []
+        for action in actions_for(5, 6, 60)[first:last]:
+            obs, rewards, _, truncated, _ = env.step(action)
+            seen.append((obs, rewards, truncated))
+        return seen
+
+    env = envs.make("hopper", 6, horizon=25, nthread=2)
+    env.reset(seed=3, options={"stagger": True})
+    run(env, 0, 30)
+    saved = env.state_dict()
+    expected = run(env, 30, 60)
+    resumed = envs.make("hopper", 6, horizon=25, nthread=0)
+    resumed.load_state_dict(saved)
+    for ours, theirs in zip(run(resumed, 30, 60), expected, strict=True):
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="saved state"):
+        envs.make("hopper", 5, nthread=0).load_state_dict(saved)
+
+
+def test_bad_input():
+    with pytest.raises(UserError, match="choose one of: hopper"):
+        envs.make("hoper", 4)
+    with pytest.raises(ValueError, match="at least 1"):
+        envs.make("hopper", 0)
+    env = envs.make("hopper", 2, nthread=0)
+    with pytest.raises(ValueError, match="actions must be"):
+        env.step(np.zeros(3))
+    with pytest.raises(ValueError, match="staggr"):
+        env.reset(options={"staggr": True})
+
+
+def test_spec_says_what_the_model_is():
+    for name, spec in envs.SPECS.items():
+        env = envs.make(name, 1, nthread=0)
+        assert env.model.opt.timestep == spec.timestep
+        assert env.model.nq - 1 + env.model.nv == spec.obs_size
+        assert env.model.nu == spec.action_size
+        assert spec.camera in [env.model.cam(i).name for i in range(env.model.ncam)]
+    assert envs.spec("hopper").dt == pytest.approx(0.008)

@@ -1,0 +1,118 @@
+"""Turns, contact and rewards against MuJoCo, gymnasium and values worked by hand."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from trainer import envs, motion
+
+
+def test_net_turns():
+    two_and_a_half = np.linspace(0, -5 * np.pi, 200)
+    assert motion.net_turns(two_and_a_half) == 2
+    assert motion.net_turns(-two_and_a_half) == -2
+    assert motion.net_turns(np.array([0.0, 0.1])) == 0, "a slight forward lean is no turn"
+    wrapped = np.angle(np.exp(1j * two_and_a_half))
+    assert motion.net_turns(wrapped) == 2
+    there_and_back = np.concatenate([two_and_a_half, two_and_a_half[::-1]])
+    np.testing.assert_array_equal(
+        motion.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0]
+    )
+
+
+def path(angles, heights):
+    """A stiff hopper whose torso has these angles and heights, (T, 6)."""
+    qpos = np.zeros((len(angles), 6))
+    qpos[:, 1], qpos[:, 2] = heights, angles
+    return qpos
+
+
+def test_clean_turns_count_only_what_the_foot_carries():
+    turn = np.linspace(0, -2 * np.pi - 0.01, 100)
+    high, low = np.full(100, 3.0), np.full(100, 0.3)
+    flying = path(turn, high)
+    rolling = path(turn, low)
+    assert motion.clean_turns(flying) == 1
+    assert motion.clean_turns(rolling) == 0
+    # One clean turn, one on the ground, one clean: two, though three turns were made.
+    mixed = np.concatenate([flying, rolling, flying])
+    mixed[100:, 2] += turn[-1]
+    mixed[200:, 2] += turn[-1]
+    assert motion.net_turns(mixed[:, 2]) == 3
+    assert motion.clean_turns(mixed) == 2
+    # A touch half-way through a turn leaves two halves: nothing.
+    touch = flying.copy()
+    touch[50, 1] = 0.2  # upside down: the head
+    assert motion.clean_turns(touch) == 0
+    np.testing.assert_array_equal(motion.clean_turns(np.stack([flying, rolling])), [1, 0])
+    assert motion.clean_turns(path(-turn, high)) == -1
+
+
+def random_qpos(count, seed):
+    rng = np.random.default_rng(seed)
+    low = [-3, 0.05, -9, -2.6, -2.6, -0.8]
+    return rng.uniform(low, [3, 1.6, 9, 0, 0, 0.8], (count, 6))
+
+
+def test_geometry_is_the_models():
+    """Joints and clearances against MuJoCo's own kinematics and contacts."""
+    env = envs.make("hopper", 1, nthread=0)
+    model, data = env.model, mujoco.MjData(env.model)
+    contacts = 0
+    for qpos in random_qpos(300, 0):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        points, gaps = motion.joint_points(qpos), motion.clearances(qpos)
+        for joint, point in (("thigh", "hip"), ("leg", "knee"), ("foot", "ankle")):
+            np.testing.assert_allclose(
+                data.joint(f"{joint}_joint").xanchor[[0, 2]], points[point], atol=1e-12
+            )
+        for part, gap in gaps.items():
+            geom = data.geom(f"{part}_geom")
+            end = geom.xpos[2] - abs(geom.xmat[8]) * model.geom(f"{part}_geom").size[1]
+            assert gap == pytest.approx(end - model.geom(f"{part}_geom").size[0], abs=1e-9)
+        floor = model.geom("floor").id
+        ids = [model.geom(f"{part}_geom").id for part in ("torso", "thigh", "leg")]
+        pairs = [set(pair) for pair in data.contact.geom]
+        touching = any({floor, i} in pairs for i in ids)
+        assert motion.fallen(qpos) == touching
+        contacts += touching
+    assert 50 < contacts < 250
+
+
+def test_backflip_reward_by_hand():
+    obs = np.zeros(11)
+    # height 1, x velocity -2, torso spin -3, joint velocities 4, 5, 6
+    obs[[0, 5, 7, 8, 9, 10]] = 1, -2, -3, 4, 5, 6
+    actions = np.array([2.0, -1.0, 0.5])
+    # clipped: work 4 - 5 + 3 = 2;  3 (1 + 0.3 + 0.2 + 0.1) = 4.8
+    assert motion.backflip_reward(obs, actions) == pytest.approx(4.8)
+    # raw: work 8 - 5 + 3 = 6;  3 (1 + 0.3 + 0.6 + 0.1) = 6
+    assert motion.backflip_reward(obs, actions, clip_actions=False) == pytest.approx(6.0)
+    assert motion.backflip_reward(np.tile(obs, (4, 5, 1)), np.tile(actions, (4, 5, 1))).shape == (
+        4,
+        5,
+    )
+
+
+def test_hop_reward_is_the_environments():
+    env = envs.make("hopper", 8, nthread=0)
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (80, 8, 3))
+    qpos, qvel, rewards = [env.qpos], [env.qvel], []
+    for action in actions:
+        rewards.append(env.step(action)[1])
+        qpos.append(env.qpos)
+        qvel.append(env.qvel)
+    qpos, qvel = np.stack(qpos, 1), np.stack(qvel, 1)
+    actions, rewards = actions.swapaxes(0, 1), np.stack(rewards, 1)
+    obs = envs.observe(env.env_spec, qpos, qvel)
+    np.testing.assert_allclose(
+        motion.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9
+    )
+    assert motion.task_reward("backflip", obs, actions, qpos, qvel).shape == (8, 80)
+    alive = motion.until_fall(qpos[:, 1:], qvel[:, 1:])
+    upright = envs.healthy(env.env_spec, qpos[:, 1:], qvel[:, 1:])
+    first_fall = (~upright).argmax(1)
+    assert (~upright).any(1).all()
+    np.testing.assert_array_equal(alive.sum(1), first_fall + 1)
