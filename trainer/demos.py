@@ -1,0 +1,393 @@
+"""The library of demos: bring a video in, normalise it, list, find, read.
+
+A demo is a directory ``<demos_dir>/<sha256>/`` with ``video.webm`` and ``demo.json``; the ones that
+come with the program are ``static/demos/<name>.webm`` and ``<name>.json``.
+
+Shapes: n frames, H rows, W columns, T control steps, q positions.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+import logging
+import math
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from trainer.errors import UserError
+from trainer.files import write_atomic
+from trainer.records import Demo
+from trainer.video import VideoReader, resample, write_webm
+
+BUILT_IN = Path(__file__).resolve().parent.parent / "static" / "demos"
+MAX_SECONDS = 60.0
+MAX_SIDE = 4096
+"""Pixels, of the video that comes in."""
+STORED_SIDE = 640
+"""Pixels, of the longer side of what is stored: more than a clip ever shows."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_log = logging.getLogger(__name__)
+
+
+def import_video(
+    path: str | Path,
+    *,
+    name: str,
+    demos_dir: Path,
+    start: float | None = None,
+    end: float | None = None,
+    crop: tuple[int, int, int, int] | None = None,
+    mirror: bool = False,
+    fps: float = 30.0,
+    task: str = "",
+    source: str = "",
+) -> Demo:
+    """Brings a video in as a demo: trimmed, cropped, at a fixed rate, at most 640 px long.
+
+    The same video with the same options is the same demo, whatever it is called the second time.
+
+    Args:
+        path: Any video file that OpenCV decodes.
+        name: What to call it: letters, digits, '-' and '_', at most 64.
+        demos_dir: Where demos are kept.
+        start: First moment to use, seconds.
+        end: Last moment to use, seconds; past the end of the video means all of it.
+        crop: (x, y, width, height) of the part to use, pixels of the upright source.
+        mirror: Swap left and right.
+        fps: Frame rate to bring it to, 1..120.
+        task: The hand-coded reward that describes the move, if known.
+        source: Where the video is from; its file name if empty.
+
+    Returns:
+        The demo, stored.
+
+    Raises:
+        UserError: If the video or an option is unusable; nothing is then stored.
+    """
+    path, demos_dir = Path(path), Path(demos_dir)
+    check_name(name)
+    _check_options(start=start, end=end, crop=crop, fps=fps)
+    with VideoReader(path) as reader:
+        _check_size(path, reader.info.width, reader.info.height, crop)
+        _check_length(path, reader.info.seconds, start=start or 0.0, end=end)
+        origin = {
+            "source_sha256": _sha256(path),
+            "options": {
+                "start": start,
+                "end": end,
+                "crop": list(crop) if crop else None,
+                "mirror": mirror,
+                "fps": fps,
+            },
+        }
+        for demo, about in _load_all(demos_dir):
+            if {key: about.get(key) for key in origin} == origin:
+                return demo
+            if demo.name == name:
+                raise UserError(f"the name {name} is taken by another demo; choose another name")
+        demos_dir.mkdir(parents=True, exist_ok=True)
+        workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        try:
+            video = workshop / "video.webm"
+            progress = _Progress(path, reader, start=start or 0.0, end=end)
+            frames = resample(
+                progress.frames(),
+                fps=fps,
+                period=1 / reader.info.fps,
+                start=start or 0.0,
+                end=math.inf if end is None else end,
+            )
+            shaped = (_shape(frame, crop=crop, mirror=mirror) for frame in frames)
+            count = write_webm(video, shaped, fps=fps)
+            progress.check_whole(count)
+            sha256 = _sha256(video)
+            demo = _describe(
+                workshop / "demo.json",
+                video,
+                name=name,
+                sha256=sha256,
+                fps=fps,
+                frames=count,
+                task=task,
+                source=source or path.name,
+                **origin,
+            )
+            final = demos_dir / sha256
+            os.replace(workshop, final)
+        except BaseException:
+            shutil.rmtree(workshop, ignore_errors=True)
+            raise
+    return _demo(demo, final / "video.webm")
+
+
+def render_demo(
+    qpos_Tq: np.ndarray,
+    *,
+    name: str,
+    task: str,
+    source: str,
+    out_dir: Path = BUILT_IN,
+    dt: float = 0.008,
+    fps: float = 30.0,
+) -> Demo:
+    """Films stored positions: ``<out_dir>/<name>.webm`` and ``<name>.json``, 480 x 360.
+
+    Args:
+        qpos_Tq: Positions at each control step, (T + 1, q) or (T, q), metres and radians.
+        name: The demo's name.
+        task: The hand-coded reward that describes the move.
+        source: The command or study that made the motion.
+        out_dir: Where to write; overwrites files of the same name.
+        dt: Seconds per control step.
+        fps: Frames per second.
+
+    Returns:
+        The demo.
+
+    Raises:
+        UserError: If the name is not allowed or this machine cannot draw.
+    """
+    from trainer.render import Renderer, steps_of_frames  # here: listing demos needs no GL
+
+    check_name(name)
+    count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)
+    steps = np.minimum(steps_of_frames(count, dt, fps), len(qpos_Tq) - 1)
+    with Renderer() as renderer:
+        frames = renderer.render(np.asarray(qpos_Tq)[steps])
+    out_dir.mkdir(parents=True, exist_ok=True)
+    temporary = out_dir / f".{name}.partial.webm"
+    try:
+        write_webm(temporary, frames, fps=fps)
+        about = _describe(
+            out_dir / f"{name}.json",
+            temporary,
+            name=name,
+            sha256=_sha256(temporary),
+            fps=fps,
+            frames=count,
+            task=task,
+            source=source,
+        )
+        os.replace(temporary, out_dir / f"{name}.webm")
+    finally:
+        temporary.unlink(missing_ok=True)
+    return _demo(about, out_dir / f"{name}.webm")
+
+
+def list_demos(demos_dir: Path) -> list[Demo]:
+    """All demos, the built-in ones included, by name. Damaged ones are logged and left out."""
+    return sorted((demo for demo, _ in _load_all(Path(demos_dir))), key=lambda demo: demo.name)
+
+
+def find_demo(name: str, demos_dir: Path) -> Demo:
+    """The demo of that name.
+
+    Raises:
+        UserError: If there is none, with the names that exist and the nearest of them.
+    """
+    demos = {demo.name: demo for demo in list_demos(demos_dir)}
+    if name in demos:
+        return demos[name]
+    near = difflib.get_close_matches(name, demos, n=1)
+    hint = f"; did you mean {near[0]}?" if near else ""
+    raise UserError(
+        f"there is no demo called {name!r}{hint} Known demos: {', '.join(demos) or 'none'}"
+        if hint
+        else f"there is no demo called {name!r}; known demos: {', '.join(demos) or 'none'}"
+    )
+
+
+def read_frames(demo: Demo) -> np.ndarray:
+    """Decodes the demo's frames.
+
+    Returns:
+        Frames, (n, H, W, 3), uint8 RGB.
+
+    Raises:
+        UserError: If the stored file is missing or damaged.
+    """
+    with VideoReader(demo.path) as reader:
+        frames = [frame for _, frame in reader.frames() if frame is not None]
+    if len(frames) != demo.frames:
+        raise UserError(
+            f"the stored video {demo.path} is damaged: {len(frames)} of {demo.frames} frames "
+            "can be read; delete its directory and add the demo again"
+        )
+    return np.stack(frames)
+
+
+def show(demo: Demo) -> str:
+    """What a person wants to know about a demo, a few lines of text."""
+    lines = {
+        "name": demo.name,
+        "length": f"{demo.seconds:.2f} s, {demo.frames} frames at {demo.fps:g} per second",
+        "size": f"{demo.width} x {demo.height} pixels",
+        "task": demo.task or "not named",
+        "source": demo.source or "not named",
+        "file": str(demo.path),
+        "sha256": demo.sha256,
+    }
+    return "\n".join(f"{key:<7} {value}" for key, value in lines.items())
+
+
+def check_name(name: str) -> None:
+    """Raises UserError unless the name is safe as a file name and in a link."""
+    if not _NAME.fullmatch(name):
+        raise UserError(f"a demo's name is 1 to 64 letters, digits, '-' or '_', got {name[:80]!r}")
+
+
+class _Progress:
+    """Watches the source's frames go by, to say afterwards what was wrong with them."""
+
+    def __init__(self, path: Path, reader: VideoReader, *, start: float, end: float | None) -> None:
+        self._path, self._reader, self._start, self._end = path, reader, start, end
+        self._seen = self._used = 0
+        self._seconds = 0.0
+
+    def frames(self) -> Iterator[tuple[float, np.ndarray | None]]:
+        """The reader's frames; raises UserError once they prove too long."""
+        for seconds, frame in self._reader.frames(self._start):
+            self._seen += 1
+            self._seconds = seconds + 1 / self._reader.info.fps
+            stop = self._seconds if self._end is None else min(self._seconds, self._end)
+            self._used += seconds >= self._start and (self._end is None or seconds < self._end)
+            if stop - self._start > MAX_SECONDS + 2 / self._reader.info.fps:
+                raise _too_long(self._path)
+            yield seconds, frame
+
+    def check_whole(self, count: int) -> None:
+        """Raises UserError if the source broke off or too little of it is left."""
+        info = self._reader.info
+        reached_end = self._end is None or self._seconds < self._end
+        # Both must fall short: the frame count of some containers is only length times rate.
+        if reached_end and self._seen < 0.9 * info.frames and self._seconds < 0.9 * info.seconds:
+            raise UserError(
+                f"{self._path} breaks off: only {self._seen} of {info.frames} frames can be read; "
+                f"give a whole file, or --end {math.floor(self._seconds * 10) / 10:g} to use these"
+            )
+        if self._seen and self._start >= self._seconds:
+            raise UserError(
+                f"--start {self._start:g} is past the end of {self._path}, which lasts {self._seconds:.2f} s"
+            )
+        if self._used < 2 or count < 2:
+            raise UserError(
+                f"a demo needs at least 2 frames, and {self._path} gives {min(self._used, count)} "
+                "between --start and --end"
+            )
+
+
+def _check_options(
+    *,
+    start: float | None,
+    end: float | None,
+    crop: tuple[int, int, int, int] | None,
+    fps: float,
+) -> None:
+    if not 1 <= fps <= 120:
+        raise UserError(f"--fps must be from 1 to 120 frames per second, got {fps:g}")
+    if start is not None and not (math.isfinite(start) and start >= 0):
+        raise UserError(f"--start must be 0 seconds or more, got {start:g}")
+    if end is not None and not end > (start or 0.0):
+        raise UserError(f"--end must be later than --start ({start or 0:g} s), got {end:g}")
+    if crop is not None and (min(crop[:2]) < 0 or min(crop[2:]) < 16):
+        raise UserError(
+            "--crop is x,y,width,height in pixels, with x and y 0 or more and at least "
+            f"16 x 16 pixels, got {','.join(map(str, crop))}"
+        )
+
+
+def _check_size(path: Path, width: int, height: int, crop: tuple[int, int, int, int] | None) -> None:
+    if max(width, height) > MAX_SIDE:
+        raise UserError(
+            f"{path} is {width} x {height} pixels; a side may have at most {MAX_SIDE}: scale it down first"
+        )
+    if crop is None and min(width, height) < 16:
+        raise UserError(f"{path} is {width} x {height} pixels; at least 16 x 16 are needed")
+    if crop is not None and (crop[0] + crop[2] > width or crop[1] + crop[3] > height):
+        raise UserError(
+            f"--crop {','.join(map(str, crop))} reaches outside the picture, "
+            f"which is {width} x {height} pixels"
+        )
+
+
+def _check_length(path: Path, seconds: float, *, start: float, end: float | None) -> None:
+    """By the container's own word, before hours of video are decoded."""
+    if not seconds:
+        return
+    if start >= seconds + 1:
+        raise UserError(f"--start {start:g} is past the end of {path}, which lasts {seconds:.2f} s")
+    # A second of slack: a container may count wrong, and each frame's own stamp is checked later.
+    if min(seconds, math.inf if end is None else end) - start > MAX_SECONDS + 1:
+        raise _too_long(path)
+
+
+def _too_long(path: Path) -> UserError:
+    return UserError(f"{path} is longer than {MAX_SECONDS:g} s; choose a part of it with --start and --end")
+
+
+def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
+    """Crops, mirrors and scales one frame; sides come out even, as the codec wants them."""
+    if crop is not None:
+        x, y, w, h = crop
+        frame = frame[y : y + h, x : x + w]
+    if mirror:
+        frame = frame[:, ::-1]
+    height, width = frame.shape[:2]
+    scale = min(1.0, STORED_SIDE / max(height, width))
+    size = (max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2))
+    if size == (width, height):
+        return np.ascontiguousarray(frame)
+    return cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
+
+
+def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
+    """Writes the demo's JSON and returns it."""
+    with VideoReader(video) as reader:
+        about |= {"width": reader.info.width, "height": reader.info.height}
+    write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
+    return about
+
+
+def _load_all(demos_dir: Path) -> Iterator[tuple[Demo, dict[str, Any]]]:
+    places = [(path, path.with_suffix(".webm")) for path in sorted(BUILT_IN.glob("*.json"))]
+    for path in sorted(demos_dir.glob("*/demo.json")):
+        if not path.parent.name.startswith("."):
+            places.append((path, path.parent / "video.webm"))
+    for path, video in places:
+        try:
+            about = json.loads(path.read_bytes())
+            if not video.is_file():
+                raise FileNotFoundError(video)
+            yield _demo(about, video), about
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            _log.warning("demo left out, %s is damaged: %r", path, error)
+
+
+def _demo(about: dict[str, Any], video: Path) -> Demo:
+    return Demo(
+        name=str(about["name"]),
+        sha256=str(about["sha256"]),
+        path=video,
+        fps=float(about["fps"]),
+        frames=int(about["frames"]),
+        width=int(about["width"]),
+        height=int(about["height"]),
+        task=str(about.get("task", "")),
+        source=str(about.get("source", "")),
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
