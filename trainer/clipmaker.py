@@ -55,7 +55,9 @@ class ClipMaker:
 
     def submit(self, clips: list[Clip]) -> list[Future[None]]:
         """Queues clips; each becomes "ready" when its picture is on disk."""
-        return [self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip)) for clip in clips]
+        return [
+            self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip)) for clip in clips
+        ]
 
     def recover(self, run: str) -> None:
         """After a restart: queues what was cut but never drawn, and what lost its picture."""

@@ -19,10 +19,10 @@ from trainer.config import RunConfig
 from trainer.errors import UserError
 from trainer.policy import Policy, PolicySnapshot
 from trainer.predictor import FitStats, Snapshot, fit, visual_inputs
-from trainer.records import Rollouts, Segment
-from trainer.rollouts import Collector
-from trainer.store import RatedSegment
+from trainer.records import Segment
 from trainer.render import frame_of_step
+from trainer.rollouts import Collector, Transitions
+from trainer.store import RatedSegment
 from trainer.trpo import Trpo
 
 _RANDOM_LANES = 16
@@ -69,7 +69,7 @@ class Learner:
         """The current policy, as a copy that any thread may use."""
         return self._policy.snapshot()
 
-    def random_rollouts(self) -> Rollouts:
+    def random_rollouts(self) -> Transitions:
         """Whole episodes of the untrained policy, which is its noise: the same for the same seed."""
         config = self.config
         policy = Policy(
@@ -107,7 +107,7 @@ class Learner:
         frames = self.frames_of(demo_step + np.arange(len(segment)))
         return float(snapshot.ratings(frames, segment.obs, segment.actions).mean())
 
-    def iterate(self, snapshot: Snapshot) -> tuple[Rollouts, dict[str, float]]:
+    def iterate(self, snapshot: Snapshot) -> tuple[Transitions, dict[str, float]]:
         """One iteration: rollouts, all scored by this one snapshot, and a TRPO step.
 
         Returns:
@@ -142,7 +142,5 @@ class Learner:
         self._collector.load_state_dict(state["collector"])
 
     def _make_collector(self, lanes: int, *, seed: int, stagger: bool) -> Collector:
-        env = envs.make(
-            self.config.env, lanes, horizon=self.demo_steps, nthread=self.config.rollouts.threads
-        )
+        env = envs.make(self.config.env, lanes, horizon=self.demo_steps, nthread=self.config.rollouts.threads)
         return Collector(env, seed=seed, stagger=stagger)

@@ -12,7 +12,8 @@ import io
 import logging
 import threading
 import time
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
-from trainer.records import Demo, Rater, Rollouts, Segment, Status
+from trainer.records import Demo, Segment, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Transitions
 from trainer.store import NewClip, Store
@@ -42,12 +43,14 @@ _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
 
 
-class RatesClips:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Simulated:
     """A rater that answers at once, in the trainer thread. People rate through the store instead."""
 
-    def __init__(self, rater: Rater, rate) -> None:  # type: ignore[no-untyped-def]
-        self.rater = rater
-        self.rate = rate
+    name: str
+    """In the store."""
+    rate: Callable[[Segment, int], int]
+    """(segment, demo step) to a rating, 1..5."""
 
 
 class Trainer:
@@ -61,7 +64,7 @@ class Trainer:
         config: The run's settings.
         encoder: Looks at the demo's frames, once.
         renderer: Draws clips for people; None if nobody looks.
-        simulated: Answers in place of people, with its name in the store; None for people.
+        simulated: Answers in place of people; None for people.
     """
 
     def __init__(
@@ -74,7 +77,7 @@ class Trainer:
         config: RunConfig,
         encoder: Encoder,
         renderer: RenderThread | None = None,
-        simulated: RatesClips | None = None,
+        simulated: Simulated | None = None,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
@@ -84,7 +87,7 @@ class Trainer:
         self._clips: ClipMaker | None = None
         self._snapshot: Snapshot | None = None
         self._fitted_event = 0
-        self._pool: Rollouts | None = None
+        self._pool: Transitions | None = None
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
@@ -184,7 +187,8 @@ class Trainer:
         saved = self._load_checkpoint(learner)
         self._learner = learner
         self._policy = learner.policy()
-        self._pool = self._pool if saved and self._pool is not None else learner.random_rollouts()
+        if not saved:
+            self._pool = learner.random_rollouts()
         self._load_snapshot()
         if self._renderer is not None:
             self._clips = ClipMaker(
@@ -228,9 +232,7 @@ class Trainer:
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
         snapshot.save(self._snapshot_file(number))
-        self.store.add_snapshot(
-            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats)
-        )
+        self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
         waiting = self.store.waiting_clips(self.run)
         predicted = {c.id: self._predict(self.store.segment(c.id), c.demo_step) for c in waiting}
@@ -238,7 +240,8 @@ class Trainer:
 
     def _ask(self, learner: Learner) -> None:
         """Cuts as many clips as are missing from the queue, from the newest rollouts."""
-        assert self._pool is not None
+        if self._pool is None:  # resumed: the first iteration brings them
+            return
         given, missing = self._ratings(), 0
         if self._simulated is not None:
             missing = self._due(learner) - given
@@ -272,9 +275,10 @@ class Trainer:
         if self._clips is not None:
             self._clips.submit(clips)
         if self._simulated is not None:
+            rater = self.store.ensure_rater(self._simulated.name, "simulated")
             for clip, cut in zip(clips, new, strict=True):
                 value = self._simulated.rate(cut.segment, clip.demo_step)
-                self.store.rate(clip.id, self._simulated.rater.id, value, latency_ms=0)
+                self.store.rate(clip.id, rater.id, value, latency_ms=0)
 
     def _due(self, learner: Learner) -> int:
         """Ratings that a simulated rater has been asked for by now, in all."""
@@ -315,7 +319,7 @@ class Trainer:
         self._retry.clear()
         while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
             try:
-                if self._learner is not None and self._pool is not None:
+                if self._learner is not None:
                     self._ask(self._learner)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)

@@ -1,0 +1,48 @@
+# Every target works on a fresh clone, does its own set-up, and is quick the second time.
+PYTHON ?= python3
+HOST ?= 127.0.0.1
+PORT ?= 8080
+DATA_DIR ?= data
+DEMO ?= hopper-backflip
+BIN := .venv/bin
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: run setup test test-fast test-long check clean
+
+run: .venv/.installed
+	$(BIN)/onedemo serve --host "$(HOST)" --port "$(PORT)" --data-dir "$(DATA_DIR)" --demo "$(DEMO)"
+
+setup: .venv/.installed
+
+test: .venv/.installed-test
+	$(BIN)/python -m pytest -m "not long"
+
+test-fast: .venv/.installed-test
+	$(BIN)/python -m pytest -m "not long and not seam"
+
+test-long: .venv/.installed-test
+	$(BIN)/python -m pytest -m long
+
+check: .venv/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+clean:
+	rm -rf .venv *.egg-info .pytest_cache .ruff_cache
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "onedemo needs Python 3.11 or newer; name one with: make PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+
+.venv/.installed: pyproject.toml | .venv/bin/python
+	@echo "installing onedemo into .venv (a few minutes the first time)"
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+.venv/.installed-test: .venv/.installed tests/install-system.sh
+	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	@sh tests/install-system.sh
+	@touch $@

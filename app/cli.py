@@ -1,0 +1,328 @@
+"""The ``onedemo`` command. Heavy libraries are imported by the command that needs them."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from trainer.errors import UserError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line and returns the exit code: 0, or 2 for bad input."""
+    try:
+        arguments = _parser().parse_args(argv)
+        return arguments.run(arguments) or 0
+    except UserError as error:
+        print(f"onedemo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone (head, less)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+class _Parser(argparse.ArgumentParser):
+    """Argument errors in one sentence that names the nearest valid option."""
+
+    def error(self, message: str) -> NoReturn:
+        unknown = re.match(r"unrecognized arguments: (\S+)", message)
+        if unknown:
+            options = [o for action in self._actions for o in action.option_strings]
+            nearest = difflib.get_close_matches(unknown[1].split("=")[0], options, n=1, cutoff=0.5)
+            hint = f"; did you mean {nearest[0]}?" if nearest else ""
+            message = f"unknown option {unknown[1]}{hint}"
+        raise UserError(f"{message} (see `{self.prog} --help`)")
+
+    def parse_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        """Lets the sub-command name its own nearest option."""
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            getattr(parsed, "parser", self).error(f"unrecognized arguments: {unknown[0]}")
+        return parsed
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="onedemo", description="Teach a simulated robot a move from one video and your ratings."
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+
+    serve = _command(commands, "serve", _serve, "the web app with its trainer thread")
+    _run_options(serve)
+    serve.add_argument("--host", default="127.0.0.1", help="address to listen on (127.0.0.1)")
+    serve.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
+    serve.add_argument("--new-run", action="store_true", help="start over instead of going on")
+
+    train = _command(commands, "train", _train, "the same trainer without a browser, rated by a program")
+    _run_options(train)
+    train.add_argument("--rater", default="oracle", help="simulated rater (oracle)")
+    train.add_argument(
+        "--ratings", type=int, metavar="N", help="ratings in all, 4 of 7 before practice (350)"
+    )
+    train.add_argument("--steps", type=int, metavar="N", help="control steps of practice (10 million)")
+    train.add_argument("--json", type=Path, metavar="FILE", help="write the summary there too")
+    train.add_argument("--quiet", action="store_true", help="no progress bar")
+
+    demo = _command(commands, "demo", None, "bring in and look at demonstration videos")
+    actions = demo.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    add = _command(actions, "add", _demo_add, "bring in a video")
+    add.add_argument("video", type=Path, help="any file that OpenCV decodes: mp4, webm, mov, avi, gif")
+    add.add_argument("--name", required=True, help="what to call it")
+    add.add_argument("--start", type=float, metavar="S", help="begin at this second")
+    add.add_argument("--end", type=float, metavar="S", help="end at this second")
+    add.add_argument("--crop", type=_crop, metavar="X,Y,W,H", help="keep this rectangle, pixels")
+    add.add_argument("--mirror", action="store_true", help="swap left and right")
+    add.add_argument("--fps", type=float, default=30.0, help="frames per second to keep (30)")
+    listing = _command(actions, "list", _demo_list, "the demos there are")
+    show = _command(actions, "show", _demo_show, "what is known of a demo")
+    show.add_argument("name")
+    for command in (add, listing, show):
+        _data_dir(command)
+
+    rater = _command(commands, "rater", None, "people and their links")
+    actions = rater.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    new = _command(actions, "add", _rater_add, "a new rater; prints the link to send")
+    new.add_argument("name")
+    new.add_argument("--researcher", action="store_true", help="may watch, steer and export too")
+    new.add_argument("--url", default="http://127.0.0.1:8080", help="address people reach the page at")
+    people = _command(actions, "list", _rater_list, "everybody")
+    revoke = _command(actions, "revoke", _rater_revoke, "end a rater's links and sessions; ratings stay")
+    revoke.add_argument("name")
+    for command in (new, people, revoke):
+        _data_dir(command)
+
+    export = _command(commands, "export", _export, "the ratings as CSV")
+    _data_dir(export)
+    export.add_argument("--out", type=Path, metavar="FILE", help="write there instead of standard output")
+    export.add_argument("--run", dest="run_name", metavar="NAME", help="only this run")
+
+    baseline = _command(commands, "baseline", None, "what the method is compared with")
+    actions = baseline.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    trpo = _command(actions, "trpo", _baseline_trpo, "TRPO on a hand-coded reward")
+    trpo.add_argument("--task", choices=("backflip", "hop"), default="backflip")
+    trpo.add_argument("--steps", type=int, default=3_000_000, help="control steps (3 million)")
+    trpo.add_argument("--seed", type=int, default=0)
+    trpo.add_argument("--out", type=Path, required=True, help="the best episode's states: PREFIX.hidden.npz")
+    return parser
+
+
+def _command(commands: Any, name: str, run: Any, summary: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=summary, description=summary[0].upper() + summary[1:] + ".")
+    parser.set_defaults(run=run, parser=parser)
+    return parser
+
+
+def _data_dir(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--data-dir", type=Path, default=Path("data"), metavar="DIR", help="where everything is kept (./data)"
+    )
+
+
+def _run_options(parser: argparse.ArgumentParser) -> None:
+    _data_dir(parser)
+    parser.add_argument("--demo", default="hopper-backflip", metavar="NAME", help="what to learn")
+    parser.add_argument(
+        "--run", dest="run_name", metavar="NAME", help="go on with this run, or name a new one"
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of all random numbers (0)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE",
+        help="one setting, such as trpo.max_kl=0.02; may be repeated",
+    )  # fmt: skip
+    parser.add_argument("--encoder", metavar="NAME", help="efficientnet-lite0 (default) or vgg16")
+    parser.add_argument("--encoder-weights", type=Path, metavar="FILE", help="instead of fetching them")
+
+
+def _config(arguments: argparse.Namespace) -> Any:
+    from trainer.config import load_config, parse_override
+
+    overrides = dict(parse_override(text) for text in arguments.settings)
+    for key in ("seed", "encoder"):
+        if getattr(arguments, key) is not None:
+            overrides[key] = getattr(arguments, key)
+    ratings = getattr(arguments, "ratings", None)
+    if ratings is not None:
+        if ratings < 2:
+            raise UserError(f"--ratings must be at least 2, got {ratings}")
+        # The paper's split of 350: 200 of a random policy, then 150 online.
+        overrides["ratings.pretrain"] = max(1, round(ratings * 4 / 7))
+        overrides["ratings.online"] = ratings - overrides["ratings.pretrain"]
+    if getattr(arguments, "steps", None) is not None:
+        overrides["rollouts.total_steps"] = arguments.steps
+    return load_config(arguments.config, overrides)
+
+
+def _encoder(arguments: argparse.Namespace, config: Any) -> Any:
+    from trainer.encoders import make_encoder
+
+    return make_encoder(config.encoder, arguments.encoder_weights)
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    from app.serve import serve
+    from trainer.demos import find_demo
+
+    config = _config(arguments)
+    serve(
+        data_dir=arguments.data_dir,
+        demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
+        config=config,
+        encoder=_encoder(arguments, config),
+        host=arguments.host,
+        port=arguments.port,
+        run=arguments.run_name,
+        new_run=arguments.new_run,
+    )
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    from trainer.demos import find_demo
+    from trainer.files import write_atomic
+    from trainer.headless import train
+    from trainer.store import Store
+
+    config = _config(arguments)
+    demo = find_demo(arguments.demo, arguments.data_dir / "demos")
+    store = Store(arguments.data_dir)
+    try:
+        summary = train(
+            store=store,
+            data_dir=arguments.data_dir,
+            demo=demo,
+            config=config,
+            encoder=_encoder(arguments, config),
+            rater=arguments.rater,
+            name=arguments.run_name,
+            progress=not arguments.quiet,
+        )
+    finally:
+        store.close()
+    for key, value in summary.items():
+        if isinstance(value, dict):
+            value = "  ".join(f"{k} {v:g}" for k, v in value.items())
+        print(f"{key:28} {value}")
+    if arguments.json is not None:
+        write_atomic(arguments.json, (json.dumps(summary, indent=2) + "\n").encode())
+
+
+def _demo_add(arguments: argparse.Namespace) -> None:
+    from trainer.demos import import_video
+
+    demo = import_video(
+        arguments.video,
+        name=arguments.name,
+        demos_dir=arguments.data_dir / "demos",
+        start=arguments.start,
+        end=arguments.end,
+        crop=arguments.crop,
+        mirror=arguments.mirror,
+        fps=arguments.fps,
+    )
+    print(f"added {demo.name}: {demo.seconds:.1f} s, {demo.frames} frames, {demo.width}x{demo.height}")
+    print(f"learn it with: onedemo serve --demo {demo.name} --data-dir {arguments.data_dir}")
+
+
+def _demo_list(arguments: argparse.Namespace) -> None:
+    from trainer.demos import list_demos
+
+    for demo in list_demos(arguments.data_dir / "demos"):
+        print(f"{demo.name:24} {demo.seconds:5.1f} s  {demo.width}x{demo.height}  {demo.source}")
+
+
+def _demo_show(arguments: argparse.Namespace) -> None:
+    import dataclasses
+
+    from trainer.demos import find_demo
+
+    demo = find_demo(arguments.name, arguments.data_dir / "demos")
+    for key, value in dataclasses.asdict(demo).items():
+        print(f"{key:8} {value}")
+
+
+def _rater_add(arguments: argparse.Namespace) -> None:
+    from app.links import issue_link, read_secret
+
+    with _open_store(arguments) as store:
+        rater = store.ensure_rater(arguments.name, "researcher" if arguments.researcher else "annotator")
+        print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
+
+
+def _rater_list(arguments: argparse.Namespace) -> None:
+    with _open_store(arguments) as store:
+        for rater in store.raters():
+            print(f"{rater.name:24} {rater.role}")
+
+
+def _rater_revoke(arguments: argparse.Namespace) -> None:
+    with _open_store(arguments) as store:
+        raters = {rater.name: rater for rater in store.raters()}
+        if arguments.name not in raters:
+            raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
+        ended = store.revoke_tokens(raters[arguments.name].id)
+        print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from app.exports import csv_blocks
+
+    with _open_store(arguments, must_exist=True) as store:
+        rows = store.iter_ratings(arguments.run_name)
+        if arguments.out is None:
+            for block in csv_blocks(rows):
+                sys.stdout.buffer.write(block)
+            sys.stdout.buffer.flush()
+            return
+        try:
+            with arguments.out.open("wb") as file:
+                for block in csv_blocks(rows):
+                    file.write(block)
+        except OSError as error:
+            raise UserError(f"cannot write {arguments.out}: {error.strerror}") from None
+
+
+def _baseline_trpo(arguments: argparse.Namespace) -> None:
+    from trainer.baselines.handcoded import train_handcoded
+
+    train_handcoded(arguments.task, steps=arguments.steps, seed=arguments.seed, out=arguments.out)
+
+
+def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
+    from contextlib import closing
+
+    from trainer.store import FILE_NAME, Store
+
+    if must_exist and not (arguments.data_dir / FILE_NAME).exists():
+        raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")
+    return closing(Store(arguments.data_dir))
+
+
+def _crop(text: str) -> tuple[int, int, int, int]:
+    try:
+        x, y, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be four whole numbers X,Y,W,H, got {text!r}") from None
+    return x, y, width, height
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"onedemo {version('onedemo')}"
+    except PackageNotFoundError:
+        return "onedemo (not installed)"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""A run without a browser, rated by a simulated rater, and its summary."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from trainer.config import RunConfig
+from trainer.encoders import Encoder
+from trainer.evaluation import summarise
+from trainer.hidden import hidden_path, load_hidden
+from trainer.loop import Simulated, Trainer
+from trainer.raters import Oracle, make_rater
+from trainer.records import Demo
+from trainer.runs import open_run, program_version
+from trainer.store import Store
+
+
+def train(
+    *,
+    store: Store,
+    data_dir: Path,
+    demo: Demo,
+    config: RunConfig,
+    encoder: Encoder,
+    rater: str = "oracle",
+    name: str | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Trains with a simulated rater from the first rating to the last step.
+
+    Args:
+        store: Takes the ratings.
+        data_dir: Of the run.
+        demo: What is to be learned; the oracle needs its hidden states.
+        config: ``ratings.pretrain + ratings.online`` is the rater's budget.
+        encoder: Looks at the demo's frames.
+        rater: Name of the simulated rater.
+        name: Of the run; an unfinished run of that name goes on.
+        progress: Show a progress bar on standard error.
+
+    Returns:
+        The summary, ready for JSON: ratings, figures over 16 episodes of the final policy, costs.
+
+    Raises:
+        UserError: If the rater or the demo is not fit for it.
+    """
+    began = time.monotonic()
+    hidden_file = hidden_path(demo.path)
+    hidden = load_hidden(hidden_file) if hidden_file.exists() else None
+    run, config = open_run(store, data_dir, demo, config, name=name, resume=name is not None)
+    budget = config.ratings.pretrain + config.ratings.online - sum(store.ratings_by_class(run))
+    simulated = make_rater(rater, hidden, demo=demo.name, budget=budget)
+    trainer = Trainer(
+        store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
+        simulated=Simulated(name=rater, rate=simulated.rate),
+    )  # fmt: skip
+    failure = _work(trainer, config.rollouts.total_steps, progress)
+    if failure is not None:
+        raise failure
+    practised = time.monotonic() - began
+    learner, snapshot = trainer.final_policy()
+    oracle = Oracle(hidden, budget=0) if hidden is not None else None
+    by_class = store.ratings_by_class(run)
+    return {
+        "run": run,
+        "demo": demo.name,
+        "ratings": sum(by_class),
+        "ratings_by_class": by_class,
+        **summarise(learner, snapshot, oracle),
+        "env_steps": learner.env_steps,
+        "steps_per_s": round(learner.env_steps / practised, 1),
+        "wall_s": round(time.monotonic() - began, 2),
+        "seed": config.seed,
+        "version": program_version(),
+    }
+
+
+def _work(trainer: Trainer, total_steps: int, progress: bool) -> BaseException | None:
+    """Runs the trainer in its thread while this one shows how far it is."""
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            trainer.work()
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=work, name="trainer", daemon=True)
+    thread.start()
+    with tqdm(total=total_steps, unit="step", unit_scale=True, disable=not progress) as bar:
+        while thread.is_alive():
+            thread.join(0.25)
+            status = trainer.status()
+            bar.set_postfix_str(f"{status.phase}, {status.ratings} ratings, snapshot {status.snapshot}")
+            bar.update(min(status.env_steps, total_steps) - bar.n)
+    return failures[0] if failures else None
