@@ -131,14 +131,14 @@ class SimilarityNet(nn.Module):
         super().__init__()
         hidden = config.hidden
         self.standard = nn.Sequential(
-            nn.Linear(STANDARD_DIMS, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU()
+            _linear(STANDARD_DIMS, hidden), nn.ReLU(), _linear(hidden, hidden), nn.ReLU()
         )
-        self.fuse_visual = nn.Linear(visual_dims, hidden, bias=False)
-        self.fuse_standard = nn.Linear(hidden, hidden)
+        self.fuse_visual = _linear(visual_dims, hidden, bias=False)
+        self.fuse_standard = _linear(hidden, hidden)
         layers: list[nn.Module] = [nn.ReLU()]
         if config.additional_layer:
-            layers += [nn.Linear(hidden, hidden), nn.ReLU()]
-        self.head = nn.Sequential(*layers, nn.Linear(hidden, CLASSES))
+            layers += [_linear(hidden, hidden), nn.ReLU()]
+        self.head = nn.Sequential(*layers, _linear(hidden, CLASSES))
         for module in self.modules():
             if isinstance(module, nn.Linear):
                 bound = module.in_features**-0.5
@@ -307,3 +307,8 @@ def class_weights(counts: torch.Tensor) -> torch.Tensor:
     present = counts > 0
     weights = counts.sum() / (present.sum() * counts.clamp(min=1).float())
     return torch.where(present, weights, torch.zeros(())).clamp(max=10.0)
+
+
+def _linear(inputs: int, outputs: int, bias: bool = True) -> nn.Linear:
+    """A layer without values yet: the usual initialisation would draw from torch's global generator."""
+    return nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)

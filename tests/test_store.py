@@ -1,0 +1,241 @@
+import sqlite3
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from trainer.errors import UserError
+from trainer.migrations import STEPS
+from trainer.records import Segment
+from trainer.store import FILE_NAME, RATING_COLUMNS, NewClip, Store, pack_segment, unpack_segment
+
+
+def segment(value=0.0):
+    return Segment(
+        obs=np.full((38, 11), value),
+        actions=np.full((38, 3), value + 1),
+        qpos=np.full((38, 6), value + 2),
+        qvel=np.full((38, 6), value + 3),
+    )
+
+
+def new_clip(**changes):
+    known = {"demo_step": 7, "segment": segment(), "stage": "pretrain", "iteration": 0}
+    return NewClip(**(known | changes))
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path)
+    store.add_run(run="r", demo="d", demo_sha256="00", seed=0, config="", version="0")
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def clips(store):
+    clips = store.add_clips("r", [new_clip(segment=segment(i), predicted=2.5, snapshot=3) for i in range(3)])
+    store.set_clip_state([c.id for c in clips], "ready")
+    return clips
+
+
+@pytest.fixture
+def ann(store):
+    return store.ensure_rater("Ann", "annotator")
+
+
+def test_segment_survives_packing_exactly():
+    packed = unpack_segment(pack_segment(segment(0.1)))
+    for name in ("obs", "actions", "qpos", "qvel"):
+        np.testing.assert_array_equal(getattr(packed, name), getattr(segment(0.1), name))
+
+
+def test_a_rating_is_a_row_of_the_documented_view(store, clips, ann):
+    event = store.rate(clips[0].id, ann.id, 4, latency_ms=812)
+    row = dict(zip(RATING_COLUMNS, *store.iter_ratings(), strict=True))
+    created = row.pop("created_at")
+    assert created.endswith("Z") and created.startswith("20")
+    assert row == {
+        "id": event, "clip_id": clips[0].id, "run": "r", "demo": "d", "rater": "Ann", "value": 4,
+        "stage": "pretrain", "iteration": 0, "latency_ms": 812, "snapshot": 3, "predicted": 2.5,
+        "demo_step": 7, "steps": 38,
+    }  # fmt: skip
+
+
+def test_another_program_reads_the_view(store, clips, ann):
+    store.rate(clips[1].id, ann.id, 2, latency_ms=1)
+    with sqlite3.connect(store.path) as other:
+        assert other.execute("SELECT clip_id, value FROM ratings").fetchall() == [(clips[1].id, 2)]
+    other.close()
+
+
+def test_durability_settings(store):
+    assert store._rows("PRAGMA journal_mode") == [("wal",)]
+    assert store._rows("PRAGMA synchronous") == [(2,)]  # FULL
+
+
+@pytest.mark.parametrize("value", [0, 6, 2.5, "3", None, True, float("nan")])
+def test_only_whole_numbers_from_1_to_5(store, clips, ann, value):
+    with pytest.raises(ValueError, match="whole number from 1 to 5"):
+        store.rate(clips[0].id, ann.id, value, latency_ms=1)
+    assert sum(store.ratings_by_class()) == 0
+
+
+def test_a_clip_is_rated_once_per_rater(store, clips, ann):
+    store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    with pytest.raises(ValueError, match="rated already"):
+        store.rate(clips[0].id, ann.id, 5, latency_ms=1)
+    bob = store.ensure_rater("Bob", "annotator")
+    store.rate(clips[0].id, bob.id, 5, latency_ms=1)
+    assert store.ratings_by_class("r") == [0, 0, 0, 1, 1]
+
+
+def test_a_rating_of_no_clip_is_refused(store, ann):
+    with pytest.raises(ValueError, match="no clip 99"):
+        store.rate(99, ann.id, 3, latency_ms=1)
+
+
+def test_events_cannot_be_changed_or_removed(store, clips, ann):
+    store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    for sql in ("UPDATE events SET value = 1", "DELETE FROM events"):
+        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+            store._rows(sql)
+    assert store.ratings_by_class() == [0, 0, 0, 1, 0]
+
+
+def test_undo_brings_the_clip_back_and_keeps_the_event(store, clips, ann):
+    store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    assert [c.id for c in store.waiting_clips("r")] == [clips[1].id, clips[2].id]
+    store.undo(clips[0].id, ann.id)
+    assert [c.id for c in store.waiting_clips("r")] == [c.id for c in clips]
+    with pytest.raises(ValueError, match="nothing to take back"):
+        store.undo(clips[0].id, ann.id)
+    store.rate(clips[0].id, ann.id, 5, latency_ms=1)
+    assert store.ratings_by_class() == [0, 0, 0, 0, 1]
+    assert store._rows("SELECT COUNT(*) FROM events") == [(3,)]
+
+
+def test_a_skipped_clip_does_not_wait_and_is_no_rating(store, clips, ann):
+    store.skip(clips[0].id, ann.id, latency_ms=1)
+    assert clips[0].id not in [c.id for c in store.waiting_clips("r")]
+    assert sum(store.ratings_by_class()) == 0
+
+
+def test_withdrawn_and_uncut_clips_do_not_wait(store, clips):
+    store.set_clip_state([clips[0].id], "withdrawn")
+    store.set_clip_state([clips[1].id], "cut")
+    assert [c.id for c in store.waiting_clips("r")] == [clips[2].id]
+
+
+def test_training_set_as_of_an_event(store, clips, ann):
+    first = store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    second = store.rate(clips[1].id, ann.id, 2, latency_ms=1)
+    store.undo(clips[0].id, ann.id)
+    assert [r.value for r in store.training_set("r", as_of=first)] == [4]
+    assert [r.value for r in store.training_set("r", as_of=second)] == [4, 2]
+    assert [r.value for r in store.training_set("r")] == [2]
+    np.testing.assert_array_equal(store.training_set("r")[0].segment.obs, segment(1).obs)
+
+
+def test_newer_predictions_reach_the_rating(store, clips, ann):
+    store.set_predictions(9, {clips[0].id: 4.5})
+    store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    row = dict(zip(RATING_COLUMNS, *store.iter_ratings(), strict=True))
+    assert (row["snapshot"], row["predicted"]) == (9, 4.5)
+
+
+def test_tokens_are_of_a_kind_and_can_be_revoked(store, ann):
+    store.add_token("aa", ann.id, "link")
+    assert store.rater_of("aa", "link") == ann
+    assert store.rater_of("aa", "session") is None
+    assert store.revoke_tokens(ann.id) == 1
+    assert store.rater_of("aa", "link") is None
+
+
+def test_a_name_has_one_role(store, ann):
+    assert store.ensure_rater("Ann", "annotator") == ann
+    with pytest.raises(UserError, match="exists already as annotator"):
+        store.ensure_rater("Ann", "researcher")
+
+
+def test_everything_is_there_after_reopening(store, clips, ann, tmp_path):
+    store.rate(clips[0].id, ann.id, 4, latency_ms=1)
+    store.add_iteration("r", 1, snapshot=2, env_steps=100, stats={"kl": 0.5})
+    store.add_snapshot("r", 2, last_event=1, ratings=1, stats={"loss": 0.1})
+    store.close()
+    again = Store(tmp_path)
+    assert again.ratings_by_class("r") == [0, 0, 0, 1, 0]
+    assert again.iterations("r") == [{"number": 1, "snapshot": 2, "env_steps": 100, "kl": 0.5}]
+    assert again.snapshots("r") == [{"number": 2, "last_event": 1, "ratings": 1, "loss": 0.1}]
+    again.close()
+
+
+def test_many_threads_rate_at_once(store, ann):
+    clips = store.add_clips("r", [new_clip() for _ in range(40)])
+
+    def work(part):
+        for clip in part:
+            store.rate(clip.id, ann.id, 3, latency_ms=1)
+
+    threads = [threading.Thread(target=work, args=(clips[i::4],)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert store.ratings_by_class("r") == [0, 0, 40, 0, 0]
+
+
+def test_a_newer_database_is_left_alone(tmp_path):
+    Store(tmp_path).close()
+    with sqlite3.connect(tmp_path / FILE_NAME) as db:
+        db.execute(f"PRAGMA user_version = {len(STEPS) + 1}")
+    db.close()
+    before = (tmp_path / FILE_NAME).read_bytes()
+    with pytest.raises(UserError, match="newer onedemo"):
+        Store(tmp_path)
+    assert (tmp_path / FILE_NAME).read_bytes() == before
+
+
+def test_a_directory_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UserError, match="not writable"):
+        Store(tmp_path / "file" / "data")
+
+
+def test_a_file_that_is_no_database(tmp_path):
+    (tmp_path / FILE_NAME).write_text("not a database, not at all " * 100)
+    with pytest.raises(UserError, match="cannot be opened"):
+        Store(tmp_path)
+
+
+_RATE_AND_DIE = """
+import os, sys
+from pathlib import Path
+from trainer.store import Store
+store = Store(Path(sys.argv[1]))
+for clip in range(1, 1000):
+    store.rate(clip, 1, 3, latency_ms=1)
+    print(clip, flush=True)
+"""
+
+
+@pytest.mark.seam
+def test_acknowledged_ratings_survive_kill_9(store, ann, tmp_path):
+    store.add_clips("r", [new_clip() for _ in range(1000)])
+    store.close()
+    child = subprocess.Popen(
+        [sys.executable, "-c", _RATE_AND_DIE, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    acknowledged = [int(child.stdout.readline()) for _ in range(60)]
+    child.kill()
+    acknowledged += [int(line) for line in child.stdout.read().split()]
+    child.stdout.close()
+    child.wait()
+    again = Store(tmp_path)
+    kept = [row[1] for row in again.iter_ratings()]
+    assert set(acknowledged) <= set(kept) and len(kept) == len(set(kept))
+    assert again._rows("PRAGMA integrity_check") == [("ok",)]
+    again.close()
