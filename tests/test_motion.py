@@ -15,9 +15,7 @@ def test_net_turns():
     wrapped = np.angle(np.exp(1j * two_and_a_half))
     assert motion.net_turns(wrapped) == 2
     there_and_back = np.concatenate([two_and_a_half, two_and_a_half[::-1]])
-    np.testing.assert_array_equal(
-        motion.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0]
-    )
+    np.testing.assert_array_equal(motion.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0])
 
 
 def path(angles, heights):
@@ -107,9 +105,7 @@ def test_hop_reward_is_the_environments():
     qpos, qvel = np.stack(qpos, 1), np.stack(qvel, 1)
     actions, rewards = actions.swapaxes(0, 1), np.stack(rewards, 1)
     obs = envs.observe(env.env_spec, qpos, qvel)
-    np.testing.assert_allclose(
-        motion.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9
-    )
+    np.testing.assert_allclose(motion.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9)
     assert motion.task_reward("backflip", obs, actions, qpos, qvel).shape == (8, 80)
     alive = motion.until_fall(qpos[:, 1:], qvel[:, 1:])
     upright = envs.healthy(env.env_spec, qpos[:, 1:], qvel[:, 1:])

@@ -55,7 +55,7 @@ def test_clock_by_hand():
     clock = policy_inputs(np.zeros(11), np.array(250), 1000, "clock")[12:]
     np.testing.assert_allclose(clock, [-0.5, 1, 0, 0, 0, 0, 0, -1, 1, 1, 1], atol=1e-12)
     assert len(clock) == 1 + 2 * len(HARMONICS)
-    end = policy_inputs(np.zeros(11), np.array([1000, 1500]), 1000, "clock")
+    end = policy_inputs(np.zeros((2, 11)), np.array([1000, 1500]), 1000, "clock")
     np.testing.assert_array_equal(end[0], end[1])
 
 
@@ -170,6 +170,4 @@ def test_rescaling_the_value_function_keeps_its_values():
         after = value(inputs)
     torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-3)
     assert value.return_mean.item() == pytest.approx(0.8 * 5 + 0.2 * 700)
-    torch.testing.assert_close(
-        targets * value.return_std + value.return_mean, torch.linspace(500, 900, 50)
-    )
+    torch.testing.assert_close(targets * value.return_std + value.return_mean, torch.linspace(500, 900, 50))

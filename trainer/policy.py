@@ -275,7 +275,8 @@ class ValueFunction(nn.Module):
 
     def __init__(self, input_size: int, hidden: Sequence[int], *, seed: int, momentum: float = 0.8) -> None:
         super().__init__()
-        self.net = mlp((input_size, *hidden, 1), 1.0, seed)
+        # V = 0 at first, in any units: nothing depends on the scale of the rewards.
+        self.net = mlp((input_size, *hidden, 1), 0.0, seed)
         self.momentum = momentum
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_std", torch.ones(()))

@@ -187,8 +187,9 @@ class Collector:
         Raises:
             ValueError: If the state is of another number of lanes or another robot.
         """
-        self.env.load_state_dict(state["env"])
-        self._clock = np.array(state["clock"], np.int32)
+        env = {k: v.numpy() if isinstance(v, torch.Tensor) else v for k, v in state["env"].items()}
+        self.env.load_state_dict(env)
+        self._clock = state["clock"].numpy().copy()
         self._rng.bit_generator.state = state["rng"]
         self._obs = self.env.obs
 
