@@ -14,12 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SKY_TOP = (214, 224, 236)
-SKY_HORIZON = (241, 244, 248)
-CHECK_DARK = (178, 187, 199)
-CHECK_LIGHT = (203, 210, 219)
-LANE = (222, 227, 233)
-SHADOW = (38, 48, 66)
+SKY_TOP = np.array((214, 224, 236), np.float32)
+SKY_HORIZON = np.array((241, 244, 248), np.float32)
+CHECK_DARK = np.array((178, 187, 199), np.float32)
+CHECK_LIGHT = np.array((203, 210, 219), np.float32)
+LANE = np.array((222, 227, 233), np.float32)
+SHADOW = np.array((38, 48, 66), np.float32)
 
 _LANE_HALF_WIDTH = 0.33
 _EDGE_HALF_WIDTH = 0.012
@@ -69,13 +69,13 @@ def backdrop(width: int, height: int, camera: Camera, limbs_L4: np.ndarray | Non
     light_hW = 0.5 + 0.5 * wave_x_hW * wave_y_h[:, None]
 
     # Row by row every colour is a blend of two, so the rest is one multiplication per pixel.
-    dark_h3 = np.broadcast_to(np.float32(CHECK_DARK), (len(y_h), 3))
-    lift_h3 = np.broadcast_to(np.float32(CHECK_LIGHT) - np.float32(CHECK_DARK), (len(y_h), 3))
+    dark_h3 = np.broadcast_to(CHECK_DARK, (len(y_h), 3))
+    lift_h3 = np.broadcast_to(CHECK_LIGHT - CHECK_DARK, (len(y_h), 3))
     lane_h1 = _covered(y_h, y_size_h, -_LANE_HALF_WIDTH, _LANE_HALF_WIDTH)[:, None] * 0.6
-    dark_h3 = dark_h3 + lane_h1 * (np.float32(LANE) - dark_h3)
+    dark_h3 = dark_h3 + lane_h1 * (LANE - dark_h3)
     lift_h3 = lift_h3 * (1 - lane_h1)
     fog_h1 = 1 - np.exp(-np.maximum(depth_h - camera.distance, 0) / 4.5)[:, None]
-    dark_h3 = dark_h3 + fog_h1 * (np.float32(SKY_HORIZON) - dark_h3)
+    dark_h3 = dark_h3 + fog_h1 * (SKY_HORIZON - dark_h3)
     lift_h3 = lift_h3 * (1 - fog_h1)
     floor = image[horizon:]
     np.multiply(light_hW[:, :, None], lift_h3[:, None], out=floor)
@@ -89,7 +89,7 @@ def backdrop(width: int, height: int, camera: Camera, limbs_L4: np.ndarray | Non
 def _sky(rows: int) -> np.ndarray:
     """The sky's colour per row, (rows, 3)."""
     t = np.linspace(0, 1, rows, dtype=np.float32)[:, None] ** 1.5
-    return np.float32(SKY_TOP) * (1 - t) + np.float32(SKY_HORIZON) * t
+    return SKY_TOP * (1 - t) + SKY_HORIZON * t
 
 
 def _triangle(x: np.ndarray) -> np.ndarray:
@@ -118,4 +118,4 @@ def _add_shadow(floor: np.ndarray, x_hW1: np.ndarray, y_h: np.ndarray, limbs_L4:
         across = np.exp(-((np.maximum(np.abs(y_h[rows]) - radius * 0.6, 0) / (soft * 1.2)) ** 2))
         along = 0.5 * (np.tanh((x - low) / soft) - np.tanh((x - high) / soft))
         clear *= 1 - (dark * across[:, None]).astype(np.float32) * along
-    floor[rows] += (1 - clear)[:, :, None] * (np.float32(SHADOW) - floor[rows])
+    floor[rows] += (1 - clear)[:, :, None] * (SHADOW - floor[rows])

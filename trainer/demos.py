@@ -112,7 +112,7 @@ def import_video(
             count = write_webm(video, shaped, fps=fps)
             progress.check_whole(count)
             sha256 = _sha256(video)
-            demo = _describe(
+            about = _describe(
                 workshop / "demo.json",
                 video,
                 name=name,
@@ -124,11 +124,16 @@ def import_video(
                 **origin,
             )
             final = demos_dir / sha256
+            known = [demo for demo in list_demos(demos_dir) if demo.sha256 == sha256]
+            if known:  # other options, same pictures
+                shutil.rmtree(workshop)
+                return known[0]
+            shutil.rmtree(final, ignore_errors=True)  # what a crash or a deleted demo left behind
             os.replace(workshop, final)
         except BaseException:
             shutil.rmtree(workshop, ignore_errors=True)
             raise
-    return _demo(demo, final / "video.webm")
+    return _demo(about, final / "video.webm")
 
 
 def render_demo(
@@ -200,12 +205,8 @@ def find_demo(name: str, demos_dir: Path) -> Demo:
     if name in demos:
         return demos[name]
     near = difflib.get_close_matches(name, demos, n=1)
-    hint = f"; did you mean {near[0]}?" if near else ""
-    raise UserError(
-        f"there is no demo called {name!r}{hint} Known demos: {', '.join(demos) or 'none'}"
-        if hint
-        else f"there is no demo called {name!r}; known demos: {', '.join(demos) or 'none'}"
-    )
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    raise UserError(f"there is no demo called {name!r}{hint}; known demos: {', '.join(demos) or 'none'}")
 
 
 def read_frames(demo: Demo) -> np.ndarray:

@@ -28,7 +28,7 @@ from trainer.gl import open_context
 WIDTH, HEIGHT = 480, 360
 """Size of one side of a clip, pixels."""
 
-HOPPER_XML = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
+HOPPER_XML = Path(str(gymnasium.__file__)).parent / "envs/mujoco/assets/hopper.xml"
 
 _SCALE = 2
 # From the head down. Each limb its own colour: head and foot are told apart at any angle.

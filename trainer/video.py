@@ -57,11 +57,11 @@ class VideoReader:
     def __init__(self, path: Path) -> None:
         if not path.is_file():
             raise UserError(f"there is no video file at {path}")
-        level = cv2.setLogLevel(0)
+        level = cv2.utils.logging.setLogLevel(0)
         try:
             self._capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         finally:
-            cv2.setLogLevel(level)
+            cv2.utils.logging.setLogLevel(level)
         width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if not self._capture.isOpened() or width < 1 or height < 1:
