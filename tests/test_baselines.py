@@ -1,0 +1,131 @@
+"""The hand-coded baseline and the trajectory optimiser on tiny budgets; the shipped demos."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from trainer import envs
+from trainer.baselines import handcoded, trajopt
+from trainer.errors import UserError
+from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
+from trainer.motion import backflip_reward, clean_turns, fallen, net_turns, until_fall
+from trainer.policy import Policy
+from trainer.rollouts import evaluate
+
+DEMOS = Path(__file__).parent.parent / "static" / "demos"
+
+
+def tiny(task="backflip", **options):
+    defaults = {"steps": 2000, "lanes": 8, "batch": 50, "horizon": 100, "evaluate_every": 2}
+    return handcoded.HandcodedConfig(task=task, **(defaults | options))
+
+
+@pytest.mark.parametrize("task", ["backflip", "hop"])
+def test_training_on_a_hand_coded_reward(task, tmp_path):
+    result = handcoded.train_handcoded(tiny(task), progress=False)
+    assert [score.steps for score in result.curve] == [800, 1600, 2000]
+    assert result.best_score.reward_mean == max(score.reward_mean for score in result.curve)
+    assert result.episode.qpos.shape == (101, 6)
+    handcoded.save_result(tmp_path / "flip.v1", result)
+    saved = load_hidden(tmp_path / "flip.v1.hidden.npz")
+    np.testing.assert_array_equal(saved.qvel, result.episode.qvel)
+    policy = Policy.from_dict(torch.load(tmp_path / "flip.v1.policy.pt", weights_only=True))
+    episodes = evaluate(policy.snapshot(), "hopper", seed=1, nthread=0)
+    assert (np.abs(episodes.qpos - saved.qpos).max((1, 2)) == 0).any(), "the episode is the policy's"
+    report = json.loads((tmp_path / "flip.v1.json").read_text())
+    assert report["config"]["task"] == task
+    assert report["best"]["reward_max"] >= report["best"]["reward_mean"]
+
+
+def test_same_seed_same_training():
+    a, b, c = (handcoded.train_handcoded(tiny(seed=s), progress=False) for s in (1, 1, 2))
+    assert a.best_score.reward_mean == b.best_score.reward_mean
+    assert a.best_score.reward_mean != c.best_score.reward_mean
+
+
+def test_backflips_are_learned_quickly():
+    config = handcoded.HandcodedConfig(steps=48_000, lanes=16, batch=250, horizon=250, evaluate_every=4)
+    result = handcoded.train_handcoded(config, progress=False)
+    first, last = result.curve[0], result.curve[-1]
+    assert last.reward_mean > 300
+    assert last.reward_mean > 2 * first.reward_mean
+
+
+def test_command_line_says_what_is_wrong():
+    with pytest.raises(UserError, match="backflip, hop"):
+        tiny("flop")
+    with pytest.raises(UserError, match="steps must be at least 1"):
+        tiny(steps=0)
+
+
+def test_timetable():
+    plan = trajopt.FlipPlan(flips=2, period=2.0, start=0.5, roll=0.8)
+    angle, height, flying = trajopt.timetable(plan, np.array([0.0, 0.5, 0.9, 1.4, 2.9, 4.5, 8.0]))
+    np.testing.assert_allclose(-angle / (2 * np.pi), [0, 0, 0.5, 1, 1.5, 2, 2], atol=0.02)
+    assert flying.tolist() == [False, False, True, False, True, False, False]
+    # The apex of a ballistic arc of 0.8 s lies g t^2 / 8 = 0.785 m up.
+    assert height[2] - height[0] == pytest.approx(9.81 * 0.8**2 / 8, abs=1e-6)
+    with pytest.raises(UserError, match="fit into its period"):
+        trajopt.FlipPlan(period=1.0)
+    with pytest.raises(UserError, match="elites"):
+        trajopt.FlipPlan(samples=4)
+
+
+def test_short_optimisation_is_a_real_episode():
+    plan = trajopt.FlipPlan(seconds=0.12, samples=8, elites=2, knots=4, iterations=1)
+    hidden = trajopt.optimise_flips(plan, progress=False)
+    assert hidden.qpos.shape == (16, 6)
+    env = envs.make("hopper", 1, nthread=0)
+    env.reset()
+    env.set_states(np.array([0]), hidden.qpos[:1], hidden.qvel[:1])
+    for t in range(15):
+        env.step(hidden.actions[t : t + 1])
+        np.testing.assert_allclose(env.qpos[0], hidden.qpos[t + 1], atol=1e-6)
+
+
+def test_hidden_states_refuse_what_they_are_not(tmp_path):
+    hidden = HiddenStates(
+        obs=np.zeros((4, 11)),
+        actions=np.zeros((3, 3), np.float32),
+        qpos=np.zeros((4, 6)),
+        qvel=np.zeros((4, 6)),
+    )
+    path = hidden_path(tmp_path / "a.demo.mp4")
+    assert path.name == "a.demo.hidden.npz"
+    save_hidden(path, hidden)
+    assert load_hidden(path).actions.dtype == np.float32
+    with pytest.raises(UserError, match="no hidden states"):
+        load_hidden(tmp_path / "missing.hidden.npz")
+    for content in (b"", b"not a zip", path.read_bytes()[:200]):
+        broken = tmp_path / "broken.hidden.npz"
+        broken.write_bytes(content)
+        with pytest.raises(UserError, match="does not hold"):
+            load_hidden(broken)
+    np.savez(tmp_path / "pickled.npz", obs=np.array([{}], dtype=object))
+    with pytest.raises(UserError, match="does not hold"):
+        load_hidden(tmp_path / "pickled.npz")
+    with pytest.raises(ValueError, match=r"T \+ 1"):
+        HiddenStates(obs=hidden.obs, actions=hidden.actions, qpos=hidden.qpos[:3], qvel=hidden.qvel)
+
+
+@pytest.mark.parametrize("name", ["hopper-backflip", "hopper-hop", "hopper-flip-clean"])
+def test_shipped_demos(name):
+    """What the guide and the bench say about the built-in demos is true of their states."""
+    hidden = load_hidden(DEMOS / f"{name}.hidden.npz")
+    assert len(hidden.actions) == 1000
+    assert np.abs(hidden.qpos[0] - [0, 1.25, 0, 0, 0, 0]).max() <= 0.005
+    spec = envs.spec("hopper")
+    np.testing.assert_allclose(hidden.obs, envs.observe(spec, hidden.qpos, hidden.qvel))
+    reward = backflip_reward(hidden.obs[1:], hidden.actions).sum()
+    if name == "hopper-backflip":
+        assert net_turns(hidden.qpos[:, 2]) >= 4
+        assert reward > 15_000
+    elif name == "hopper-flip-clean":
+        assert clean_turns(hidden.qpos) >= 2
+        assert not fallen(hidden.qpos).any()
+    else:
+        assert until_fall(hidden.qpos[1:], hidden.qvel[1:]).all()
+        assert hidden.qpos[-1, 0] > 8, "a lively hop goes forward"
