@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from trainer.errors import UserError
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -33,3 +38,21 @@ def write_atomic(path: Path, data: bytes) -> None:
         os.fsync(directory)  # the rename itself must survive a power cut
     finally:
         os.close(directory)
+
+
+@contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Holds a lock file: one process at a time, released when it ends, however it ends.
+
+    Raises:
+        UserError: If another process holds it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserError(
+                f"another onedemo is working on {path.parent}; stop it, or choose another --run or --data-dir"
+            ) from None
+        yield

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from trainer.config import RunConfig
 from trainer.encoders import Encoder
 from trainer.evaluation import summarise
+from trainer.files import hold
 from trainer.hidden import hidden_path, load_hidden
 from trainer.loop import Simulated, Trainer
 from trainer.raters import Oracle, make_rater
@@ -59,7 +60,8 @@ def train(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate),
     )  # fmt: skip
-    failure = _work(trainer, config.rollouts.total_steps, progress)
+    with hold(trainer.directory / "lock"):
+        failure = _work(trainer, config.rollouts.total_steps, progress)
     if failure is not None:
         raise failure
     practised = time.monotonic() - began

@@ -1,0 +1,87 @@
+"""Puts the web app together: store, trainer thread, page, front; and takes it apart in order."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+from pathlib import Path
+
+from app.front import Front
+from app.links import issue_link, read_secret
+from app.server import Page
+from trainer.config import RunConfig
+from trainer.encoders import Encoder
+from trainer.files import hold
+from trainer.loop import Trainer
+from trainer.records import Demo
+from trainer.render import RenderThread
+from trainer.runs import open_run
+from trainer.store import Store
+
+
+def serve(
+    *,
+    data_dir: Path,
+    demo: Demo,
+    config: RunConfig,
+    encoder: Encoder,
+    host: str,
+    port: int,
+    run: str | None,
+    new_run: bool,
+) -> None:
+    """Serves one run until the process is told to end (Ctrl-C or SIGTERM).
+
+    Prints ``researcher: URL`` and ``annotator: URL`` once both can be opened.
+
+    Args:
+        data_dir: Everything is kept there.
+        demo: What is to be learned.
+        config: Settings of the run.
+        encoder: Looks at the demo's frames.
+        host: Address to listen on.
+        port: Port of the page.
+        run: Name of the run to go on with or to make; None: the newest of this demo.
+        new_run: Start over even if there is a run of this demo.
+
+    Raises:
+        UserError: If the data directory, the port or the graphics library cannot be used.
+    """
+    store = Store(data_dir)
+    renderer = RenderThread()
+    secret = read_secret(data_dir)
+    run, config = open_run(store, data_dir, demo, config, name=run, resume=not new_run)
+    directory = data_dir / "runs" / run
+    with hold(directory / "lock"):
+        _log_to(directory / "log")
+        trainer = Trainer(
+            store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
+            renderer=renderer,
+        )  # fmt: skip
+        page = Page(trainer)
+        front = Front(trainer, page, host=host, port=port)
+        ended = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: ended.set())
+        try:
+            url = front.start()
+            trainer.start()
+            for role in ("researcher", "annotator"):
+                rater = store.ensure_rater(role, role)
+                print(f"{role}: {issue_link(store, secret, rater, url)}", flush=True)
+            ended.wait()
+        finally:
+            front.close()
+            page.close()
+            trainer.stop()
+            renderer.close()
+            store.close()
+
+
+def _log_to(file: Path) -> None:
+    handler = logging.FileHandler(file)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger = logging.getLogger("onedemo")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
