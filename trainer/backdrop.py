@@ -114,7 +114,7 @@ def _add_shadow(floor: np.ndarray, x_hW1: np.ndarray, y_h: np.ndarray, limbs_L4:
     for low, high, lift, radius in limbs_L4.astype(np.float32):
         lift = max(float(lift), 0.0)
         soft = 0.035 + 0.16 * lift
-        dark = 0.62 * np.exp(-lift / 0.55) * 0.05 / (0.05 + 0.35 * lift * radius / 0.05)
+        dark = 0.6 * np.exp(-lift / 0.9)
         across = np.exp(-((np.maximum(np.abs(y_h[rows]) - radius * 0.6, 0) / (soft * 1.2)) ** 2))
         along = 0.5 * (np.tanh((x - low) / soft) - np.tanh((x - high) / soft))
         clear *= 1 - (dark * across[:, None]).astype(np.float32) * along

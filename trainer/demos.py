@@ -98,6 +98,7 @@ def import_video(
                 raise UserError(f"the name {name} is taken by another demo; choose another name")
         demos_dir.mkdir(parents=True, exist_ok=True)
         workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        workshop.chmod(0o755)  # made for this user alone, but others may read demos
         try:
             video = workshop / "video.webm"
             progress = _Progress(path, reader, start=start or 0.0, end=end)

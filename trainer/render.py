@@ -33,9 +33,9 @@ HOPPER_XML = Path(str(gymnasium.__file__)).parent / "envs/mujoco/assets/hopper.x
 _SCALE = 2
 # From the head down. Each limb its own colour: head and foot are told apart at any angle.
 _LIMB_COLOURS = ((0.91, 0.29, 0.17), (0.13, 0.25, 0.47), (0.20, 0.48, 0.76), (0.97, 0.69, 0.15))
-_FOVY = 45.0
-_CAMERA_HEIGHT = 1.02
-_FREE_ABOVE = 1.06  # the robot may rise this far above the camera before the camera follows
+_FOVY = 39.0
+_CAMERA_HEIGHT = 0.88
+_FREE_ABOVE = 0.95  # the robot may rise this far above the camera before the camera follows
 
 T = TypeVar("T")
 
@@ -91,8 +91,8 @@ class Renderer:
         self.width, self.height = width, height
         self._thread = threading.get_ident()
         big = (height * _SCALE, width * _SCALE)
-        self._context: Any = open_context(big[1], big[0])
         self._model = _studio_model(Path(model_path), width=big[1], height=big[0])
+        self._context: Any = open_context(big[1], big[0])
         self._data = mujoco.MjData(self._model)
         self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
@@ -138,6 +138,8 @@ class Renderer:
     def close(self) -> None:
         """Frees the GL context. Closing twice does nothing."""
         if self._context is not None:
+            # Freed under another context, it would delete that one's textures and buffers.
+            self._context.make_current()
             self._mjr.free()
             self._context.free()
             self._context = None
@@ -243,7 +245,7 @@ class RenderThread:
                 future, job = entry
                 if self._closed:
                     future.cancel()
-                elif future.set_running_or_notify_cancel():
+                if future.set_running_or_notify_cancel():
                     try:
                         future.set_result(job(renderer))
                     except BaseException as error:
