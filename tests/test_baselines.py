@@ -11,8 +11,15 @@ from trainer import envs
 from trainer.baselines import handcoded, trajopt
 from trainer.errors import UserError
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from trainer.motion import backflip_reward, clean_turns, fallen, net_turns, until_fall
-from trainer.policy import Policy
+from trainer.motion import (
+    backflip_reward,
+    clean_turns,
+    fallen,
+    net_turns,
+    task_reward,
+    until_fall,
+)
+from trainer.policy import Policy, PolicyConfig
 from trainer.rollouts import evaluate
 
 DEMOS = Path(__file__).parent.parent / "static" / "demos"
@@ -46,12 +53,14 @@ def test_same_seed_same_training():
     assert a.best_score.reward_mean != c.best_score.reward_mean
 
 
-def test_backflips_are_learned_quickly():
-    config = handcoded.HandcodedConfig(steps=48_000, lanes=16, batch=250, horizon=250, evaluate_every=4)
-    result = handcoded.train_handcoded(config, progress=False)
-    first, last = result.curve[0], result.curve[-1]
-    assert last.reward_mean > 300
-    assert last.reward_mean > 2 * first.reward_mean
+def test_backflips_begin_within_16_thousand_steps():
+    """Not yet turns, but falling over backwards and kicking: twice the untrained reward."""
+    untrained = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=250, seed=0)
+    still = evaluate(untrained.snapshot(), "hopper", nthread=0)
+    before = task_reward("backflip", still.obs, still.actions, still.qpos, still.qvel).sum(1).mean()
+    config = handcoded.HandcodedConfig(steps=16_000, lanes=16, batch=250, horizon=250)
+    after = handcoded.train_handcoded(config, progress=False).curve[-1].reward_mean
+    assert after > 2 * before
 
 
 def test_command_line_says_what_is_wrong():

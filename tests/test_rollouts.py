@@ -129,7 +129,7 @@ class Elastic(EpisodeRules):
         return step.clock + 2
 
     def stop(self, step, next_clock):
-        return step.next_qpos[:, 1] < 0.9
+        return step.next_qpos[:, 1] < 1.2
 
 
 def test_rules_start_advance_and_stop():
@@ -141,7 +141,7 @@ def test_rules_start_advance_and_stop():
     assert (batch.clock == 0).any()
     ended = batch.terminated | batch.truncated
     assert (batch.next_clock - batch.clock == 2).all()
-    np.testing.assert_array_equal(batch.terminated, batch.next_qpos[..., 1] < 0.9)
+    np.testing.assert_array_equal(batch.terminated, batch.next_qpos[..., 1] < 1.2)
     np.testing.assert_array_equal(batch.truncated, (batch.next_clock >= HORIZON) & ~batch.terminated)
     assert batch.terminated.any()
     assert batch.truncated.any()
@@ -152,7 +152,6 @@ def test_rules_start_advance_and_stop():
     # A lane that the rules ended starts anew: a standing start, or in the air.
     restarts = batch.qpos[:, 1:][ended[:, :-1]]
     assert np.isin(restarts[:, 1].round(1), [1.2, 1.3, 1.6]).all()
-    np.testing.assert_array_equal(lanes.env.elapsed >= 0, True)
 
 
 def test_evaluate_gives_whole_episodes():
@@ -165,10 +164,8 @@ def test_evaluate_gives_whole_episodes():
     np.testing.assert_array_equal(
         episodes.obs, envs.observe(envs.spec("hopper"), episodes.qpos, episodes.qvel)
     )
-    np.testing.assert_array_equal(
-        episodes.actions,
-        snapshot.act(snapshot.inputs(episodes.obs[:, :-1], episodes.clock[:, :-1])),
-    )
+    means = snapshot.act(snapshot.inputs(episodes.obs[:, :-1], episodes.clock[:, :-1]))
+    np.testing.assert_allclose(episodes.actions, means, atol=1e-5)
     again = evaluate(snapshot, "hopper", episodes=3, seed=5, nthread=2)
     np.testing.assert_array_equal(again.qpos, episodes.qpos)
     other = evaluate(snapshot, "hopper", episodes=3, seed=6, nthread=0)

@@ -62,7 +62,7 @@ def load_hidden(path: Path) -> HiddenStates:
         UserError: If the file is missing or is not such an episode.
     """
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             return HiddenStates(**{name: data[name] for name in _FIELDS})
     except FileNotFoundError:
         raise UserError(f"no hidden states at {path}") from None
