@@ -14,7 +14,6 @@ import json
 import logging
 import math
 import os
-import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -24,19 +23,16 @@ from typing import Any
 import cv2
 import numpy as np
 
+from trainer.demo_checks import SourceWatch, check_length, check_name, check_options, check_size
 from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.records import Demo
 from trainer.video import VideoReader, resample, write_webm
 
 BUILT_IN = Path(__file__).resolve().parent.parent / "static" / "demos"
-MAX_SECONDS = 60.0
-MAX_SIDE = 4096
-"""Pixels, of the video that comes in."""
 STORED_SIDE = 640
 """Pixels, of the longer side of what is stored: more than a clip ever shows."""
 
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _log = logging.getLogger(__name__)
 
 
@@ -77,10 +73,10 @@ def import_video(
     """
     path, demos_dir = Path(path), Path(demos_dir)
     check_name(name)
-    _check_options(start=start, end=end, crop=crop, fps=fps)
+    check_options(start=start, end=end, crop=crop, fps=fps)
     with VideoReader(path) as reader:
-        _check_size(path, reader.info.width, reader.info.height, crop)
-        _check_length(path, reader.info.seconds, start=start or 0.0, end=end)
+        check_size(path, reader.info.width, reader.info.height, crop)
+        check_length(path, reader.info.seconds, start=start or 0.0, end=end)
         origin = {
             "source_sha256": _sha256(path),
             "options": {
@@ -91,19 +87,20 @@ def import_video(
                 "fps": fps,
             },
         }
-        for demo, about in _load_all(demos_dir):
+        stored = list(_load_all(demos_dir))
+        for demo, about in stored:
             if {key: about.get(key) for key in origin} == origin:
                 return demo
-            if demo.name == name:
-                raise UserError(f"the name {name} is taken by another demo; choose another name")
+        if name in {demo.name for demo, _ in stored}:
+            raise UserError(f"the name {name} is taken by another demo; choose another --name")
         demos_dir.mkdir(parents=True, exist_ok=True)
         workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
         workshop.chmod(0o755)  # made for this user alone, but others may read demos
         try:
             video = workshop / "video.webm"
-            progress = _Progress(path, reader, start=start or 0.0, end=end)
+            watch = SourceWatch(path, reader, start=start or 0.0, end=end)
             frames = resample(
-                progress.frames(),
+                watch.frames(),
                 fps=fps,
                 period=1 / reader.info.fps,
                 start=start or 0.0,
@@ -111,7 +108,7 @@ def import_video(
             )
             shaped = (_shape(frame, crop=crop, mirror=mirror) for frame in frames)
             count = write_webm(video, shaped, fps=fps)
-            progress.check_whole(count)
+            watch.check_whole(count)
             sha256 = _sha256(video)
             about = _describe(
                 workshop / "demo.json",
@@ -125,11 +122,11 @@ def import_video(
                 **origin,
             )
             final = demos_dir / sha256
-            known = [demo for demo in list_demos(demos_dir) if demo.sha256 == sha256]
-            if known:  # other options, same pictures
-                shutil.rmtree(workshop)
-                return known[0]
-            shutil.rmtree(final, ignore_errors=True)  # what a crash or a deleted demo left behind
+            for demo, _ in stored:
+                if demo.sha256 == sha256:  # other options that give the same pictures
+                    shutil.rmtree(workshop)
+                    return demo
+            shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
             os.replace(workshop, final)
         except BaseException:
             shutil.rmtree(workshop, ignore_errors=True)
@@ -219,11 +216,14 @@ def read_frames(demo: Demo) -> np.ndarray:
     Raises:
         UserError: If the stored file is missing or damaged.
     """
-    with VideoReader(demo.path) as reader:
-        frames = [frame for _, frame in reader.frames() if frame is not None]
+    try:
+        with VideoReader(demo.path) as reader:
+            frames = [frame for _, frame in reader.frames() if frame is not None]
+    except UserError:  # its advice is for videos on their way in
+        frames = []
     if len(frames) != demo.frames:
         raise UserError(
-            f"the stored video {demo.path} is damaged: {len(frames)} of {demo.frames} frames "
+            f"the stored video {demo.path} is missing or damaged: {len(frames)} of {demo.frames} frames "
             "can be read; delete its directory and add the demo again"
         )
     return np.stack(frames)
@@ -241,101 +241,6 @@ def show(demo: Demo) -> str:
         "sha256": demo.sha256,
     }
     return "\n".join(f"{key:<7} {value}" for key, value in lines.items())
-
-
-def check_name(name: str) -> None:
-    """Raises UserError unless the name is safe as a file name and in a link."""
-    if not _NAME.fullmatch(name):
-        raise UserError(f"a demo's name is 1 to 64 letters, digits, '-' or '_', got {name[:80]!r}")
-
-
-class _Progress:
-    """Watches the source's frames go by, to say afterwards what was wrong with them."""
-
-    def __init__(self, path: Path, reader: VideoReader, *, start: float, end: float | None) -> None:
-        self._path, self._reader, self._start, self._end = path, reader, start, end
-        self._seen = self._used = 0
-        self._seconds = 0.0
-
-    def frames(self) -> Iterator[tuple[float, np.ndarray | None]]:
-        """The reader's frames; raises UserError once they prove too long."""
-        for seconds, frame in self._reader.frames(self._start):
-            self._seen += 1
-            self._seconds = seconds + 1 / self._reader.info.fps
-            stop = self._seconds if self._end is None else min(self._seconds, self._end)
-            self._used += seconds >= self._start and (self._end is None or seconds < self._end)
-            if stop - self._start > MAX_SECONDS + 2 / self._reader.info.fps:
-                raise _too_long(self._path)
-            yield seconds, frame
-
-    def check_whole(self, count: int) -> None:
-        """Raises UserError if the source broke off or too little of it is left."""
-        info = self._reader.info
-        reached_end = self._end is None or self._seconds < self._end
-        # Both must fall short: the frame count of some containers is only length times rate.
-        if reached_end and self._seen < 0.9 * info.frames and self._seconds < 0.9 * info.seconds:
-            raise UserError(
-                f"{self._path} breaks off: only {self._seen} of {info.frames} frames can be read; "
-                f"give a whole file, or --end {math.floor(self._seconds * 10) / 10:g} to use these"
-            )
-        if self._seen and self._start >= self._seconds:
-            raise UserError(
-                f"--start {self._start:g} is past the end of {self._path}, which lasts {self._seconds:.2f} s"
-            )
-        if self._used < 2 or count < 2:
-            raise UserError(
-                f"a demo needs at least 2 frames, and {self._path} gives {min(self._used, count)} "
-                "between --start and --end"
-            )
-
-
-def _check_options(
-    *,
-    start: float | None,
-    end: float | None,
-    crop: tuple[int, int, int, int] | None,
-    fps: float,
-) -> None:
-    if not 1 <= fps <= 120:
-        raise UserError(f"--fps must be from 1 to 120 frames per second, got {fps:g}")
-    if start is not None and not (math.isfinite(start) and start >= 0):
-        raise UserError(f"--start must be 0 seconds or more, got {start:g}")
-    if end is not None and not end > (start or 0.0):
-        raise UserError(f"--end must be later than --start ({start or 0:g} s), got {end:g}")
-    if crop is not None and (min(crop[:2]) < 0 or min(crop[2:]) < 16):
-        raise UserError(
-            "--crop is x,y,width,height in pixels, with x and y 0 or more and at least "
-            f"16 x 16 pixels, got {','.join(map(str, crop))}"
-        )
-
-
-def _check_size(path: Path, width: int, height: int, crop: tuple[int, int, int, int] | None) -> None:
-    if max(width, height) > MAX_SIDE:
-        raise UserError(
-            f"{path} is {width} x {height} pixels; a side may have at most {MAX_SIDE}: scale it down first"
-        )
-    if crop is None and min(width, height) < 16:
-        raise UserError(f"{path} is {width} x {height} pixels; at least 16 x 16 are needed")
-    if crop is not None and (crop[0] + crop[2] > width or crop[1] + crop[3] > height):
-        raise UserError(
-            f"--crop {','.join(map(str, crop))} reaches outside the picture, "
-            f"which is {width} x {height} pixels"
-        )
-
-
-def _check_length(path: Path, seconds: float, *, start: float, end: float | None) -> None:
-    """By the container's own word, before hours of video are decoded."""
-    if not seconds:
-        return
-    if start >= seconds + 1:
-        raise UserError(f"--start {start:g} is past the end of {path}, which lasts {seconds:.2f} s")
-    # A second of slack: a container may count wrong, and each frame's own stamp is checked later.
-    if min(seconds, math.inf if end is None else end) - start > MAX_SECONDS + 1:
-        raise _too_long(path)
-
-
-def _too_long(path: Path) -> UserError:
-    return UserError(f"{path} is longer than {MAX_SECONDS:g} s; choose a part of it with --start and --end")
 
 
 def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
