@@ -163,7 +163,7 @@ class Trainer:
         learner = self._prepare()
         limit = self.config.rollouts.total_steps
         while not self._stop.is_set():
-            self._ask(learner)
+            self._ask(learner, resting=self._pause.is_set())
             if learner.env_steps >= limit:
                 self._tell("done", "The agent has practised as long as it was told to.")
                 if self._simulated is not None:
@@ -238,8 +238,12 @@ class Trainer:
         predicted = {c.id: self._predict(self.store.segment(c.id), c.demo_step) for c in waiting}
         self.store.set_predictions(number, {i: p for i, p in predicted.items() if p is not None})
 
-    def _ask(self, learner: Learner) -> None:
-        """Cuts as many clips as are missing from the queue, from the newest rollouts."""
+    def _ask(self, learner: Learner, *, resting: bool = False) -> None:
+        """Cuts as many clips as are missing from the queue, from the newest rollouts.
+
+        After pretraining the first online clips wait for the first iteration, unless none will come
+        because the trainer is ``resting``.
+        """
         if self._pool is None:  # resumed: the first iteration brings them
             return
         given, missing = self._ratings(), 0
@@ -247,7 +251,7 @@ class Trainer:
             missing = self._due(learner) - given
         elif given < self._status.target_ratings:
             stage_end = self._status.target_ratings
-            if learner.iteration == 0:
+            if learner.iteration == 0 and not resting:
                 stage_end = self.config.ratings.pretrain
             waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
             missing = min(self.config.ratings.queue, stage_end - given) - len(waiting)
@@ -320,7 +324,7 @@ class Trainer:
         while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
             try:
                 if self._learner is not None:
-                    self._ask(self._learner)
+                    self._ask(self._learner, resting=True)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")

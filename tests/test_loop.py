@@ -1,0 +1,272 @@
+import ast
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from worlds import Thumbnail, falling_demo, small_config
+
+import trainer
+from trainer.headless import train
+from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
+from trainer.loop import Simulated, Trainer
+from trainer.runs import open_run
+from trainer.store import Store
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    return falling_demo(tmp_path_factory.mktemp("demo"))
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path)
+    yield store
+    store.close()
+
+
+def make_trainer(store, demo, simulated=None, config=None, name="r"):
+    data_dir = store.path.parent
+    run, config = open_run(store, data_dir, demo, config or small_config(), name=name, resume=True)
+    return Trainer(
+        store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=Thumbnail(),
+        simulated=simulated,
+    )  # fmt: skip
+
+
+def by_rule(segment, demo_step):
+    """A rater without hidden states: a fixed rule of what the robot does."""
+    return int(np.clip(round(1 + 4 * segment.obs[:, 0].mean() + demo_step % 2), 1, 5))
+
+
+def wait_for(condition, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def rate_all(store, run, rater, value=3):
+    for state in ("cut", "ready"):
+        for clip in store.waiting_clips(run, state):
+            store.rate(clip.id, rater.id, value, latency_ms=5)
+
+
+def test_a_headless_run_gives_its_summary(store, demo):
+    summary = train(
+        store=store,
+        data_dir=store.path.parent,
+        demo=demo,
+        config=small_config(),
+        encoder=Thumbnail(),
+        progress=False,
+    )
+    assert summary["ratings"] == sum(summary["ratings_by_class"]) == 18
+    assert summary["env_steps"] == 2400
+    for key in (
+        "predicted_similarity", "true_similarity", "backflip_reward", "backflip_reward_raw_actions",
+        "net_turns", "clean_turns",
+    ):  # fmt: skip
+        assert summary[key]["worst"] <= summary[key]["mean"] <= summary[key]["best"], key
+    assert 1 <= summary["predicted_similarity"]["worst"] <= summary["predicted_similarity"]["best"] <= 5
+    assert {"steps_per_s", "wall_s", "seed", "version"} <= summary.keys()
+    iterations = store.iterations(summary["run"])
+    assert [row["number"] for row in iterations] == [1, 2, 3, 4, 5, 6]
+    assert "true_reward" in iterations[0] and iterations[0]["kl"] <= 0.05
+
+
+def test_every_reward_can_be_traced_to_ratings(store, demo):
+    summary = train(
+        store=store,
+        data_dir=store.path.parent,
+        demo=demo,
+        config=small_config(),
+        encoder=Thumbnail(),
+        progress=False,
+    )
+    run = summary["run"]
+    snapshots = {row["number"]: row for row in store.snapshots(run)}
+    for iteration in store.iterations(run):
+        snapshot = snapshots[iteration["snapshot"]]
+        ratings = store.training_set(run, as_of=snapshot["last_event"])
+        assert len(ratings) == snapshot["ratings"] >= 12
+        assert (store.path.parent / "runs" / run / "snapshots" / f"{iteration['snapshot']:06d}.pt").exists()
+    stages = [row[6] for row in store.iter_ratings(run)]
+    assert stages.count("pretrain") == 12 and stages.count("online") == 6
+
+
+def test_the_same_seed_gives_the_same_run(demo, tmp_path):
+    curves = []
+    for name in ("one", "two"):
+        store = Store(tmp_path / name)
+        make_trainer(store, demo, Simulated(name="rule", rate=by_rule)).work()
+        rows = store.iterations("r")
+        curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
+        store.close()
+    assert curves[0] == curves[1] and len(curves[0]) == 6
+
+
+def test_a_stopped_run_goes_on_where_it_was(store, demo):
+    first: Trainer
+
+    def rate_and_stop(segment, demo_step):
+        if first.status().iteration >= 3:
+            first.stop()
+        return by_rule(segment, demo_step)
+
+    first = make_trainer(store, demo, Simulated(name="rule", rate=rate_and_stop))
+    first.work()
+    before = store.iterations("r")
+    assert 3 <= len(before) < 6 and first.status().phase == "stopped"
+    second = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
+    second.work()
+    after = store.iterations("r")
+    assert after[: len(before)] == before
+    assert [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
+    assert after[-1]["env_steps"] == 2400 and sum(store.ratings_by_class("r")) == 18
+    numbers = [row["number"] for row in store.snapshots("r")]
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_people_rate_and_the_trainer_follows(store, demo):
+    ann = store.ensure_rater("Ann", "annotator")
+    trainer_ = make_trainer(store, demo, config=small_config(rollouts__total_steps=10**6))
+    trainer_.start()
+    wait_for(lambda: trainer_.status().phase == "pretrain")
+    assert trainer_.acting_policy() is not None
+    for _ in range(4):
+        wait_for(lambda: store.waiting_clips("r", "cut"))
+        assert len(store.waiting_clips("r", "cut")) <= 4  # the queue is not longer than asked
+        rate_all(store, "r", ann)
+        if trainer_.status().phase == "online":
+            break
+    wait_for(lambda: trainer_.status().iteration >= 2)
+    fitted = store.snapshots("r")[-1]["last_event"]
+    wait_for(lambda: store.waiting_clips("r", "cut"))
+    rate_all(store, "r", ann, value=5)
+    wait_for(lambda: store.snapshots("r")[-1]["last_event"] > fitted)
+    trainer_.pause()
+    wait_for(lambda: trainer_.status().phase == "paused")
+    iterations = trainer_.status().iteration
+    time.sleep(0.5)
+    assert trainer_.status().iteration == iterations
+    trainer_.resume()
+    wait_for(lambda: trainer_.status().iteration > iterations)
+    trainer_.stop()
+    assert trainer_.status().phase == "stopped"
+
+
+def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypatch):
+    ann = store.ensure_rater("Ann", "annotator")
+    trainer_ = make_trainer(
+        store, demo, config=small_config(rollouts__total_steps=10**6, ratings__online=200)
+    )
+
+    def break_down(self, snapshot):
+        raise FloatingPointError("the policy has exploded")
+
+    with monkeypatch.context() as broken:
+        broken.setattr("trainer.learner.Learner.iterate", break_down)
+        trainer_.start()
+        wait_for(lambda: rate_all(store, "r", ann) or trainer_.status().phase == "failed")
+        assert trainer_.status().error == "FloatingPointError: the policy has exploded"
+        given = trainer_.status().ratings
+        wait_for(lambda: store.waiting_clips("r", "cut"))
+        rate_all(store, "r", ann)
+        assert trainer_.status().ratings > given
+    trainer_.resume()
+    wait_for(lambda: trainer_.status().iteration >= 1)
+    assert trainer_.status().error == ""
+    trainer_.stop()
+
+
+def test_a_half_written_checkpoint_is_never_read(store, demo):
+    trainer_ = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
+    trainer_.work()
+    files = [p.name for p in trainer_.directory.rglob("*") if p.is_file()]
+    assert not [name for name in files if name.startswith(".")]  # no temporary file is left
+
+
+# Nothing that learns can reach the demo's hidden states.
+
+LEARNING = (
+    "loop",
+    "learner",
+    "predictor",
+    "policy",
+    "trpo",
+    "rollouts",
+    "choice",
+    "encoders",
+    "demos",
+    "clipmaker",
+)
+
+
+def imports_of(module):
+    source = Path(trainer.__file__).parent / f"{module.replace('.', '/')}.py"
+    found = set()
+    for node in ast.walk(ast.parse(source.read_text())):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module] + [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        found |= {name.removeprefix("trainer.") for name in names if name.startswith("trainer.")}
+    folder = Path(trainer.__file__).parent
+    return {name for name in found if (folder / f"{name.replace('.', '/')}.py").exists()}
+
+
+@pytest.mark.parametrize("module", LEARNING)
+def test_learning_code_does_not_import_hidden_states(module):
+    reached, todo = set(), {module}
+    while todo:
+        name = todo.pop()
+        reached.add(name)
+        todo |= imports_of(name) - reached
+    assert not reached & {"hidden", "raters", "evaluation", "headless"}, reached
+
+
+_opened: list[str] = []
+_watching = False
+
+
+def _note_opens(event, arguments):
+    if _watching and event == "open" and isinstance(arguments[0], str | bytes | Path):
+        _opened.append(str(arguments[0]))
+
+
+sys.addaudithook(_note_opens)
+
+
+def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_path):
+    """With the hidden states replaced by noise, the same ratings give the same policy."""
+    global _watching
+    file = hidden_path(demo.path)
+    truth = load_hidden(file)
+    weights = []
+    try:
+        for name in ("truth", "noise"):
+            if name == "noise":
+                rng = np.random.default_rng(0)
+                fields = ("obs", "actions", "qpos", "qvel")
+                save_hidden(
+                    file, HiddenStates(**{f: rng.normal(size=getattr(truth, f).shape) for f in fields})
+                )
+            store = Store(tmp_path / name)
+            _opened.clear()
+            _watching = True
+            trainer_ = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
+            trainer_.work()
+            _watching = False
+            assert any(path.endswith("config.toml") or "checkpoint" in path for path in _opened)
+            assert not [path for path in _opened if path.endswith(".hidden.npz")]
+            weights.append(trainer_.final_policy()[0].policy().weights)
+            store.close()
+    finally:
+        _watching = False
+        save_hidden(file, truth)
+    for one, two in zip(*weights, strict=True):
+        np.testing.assert_array_equal(one, two)

@@ -1,0 +1,82 @@
+"""A small world for tests of the trainer: a two-second demo whose states are known, and a cheap encoder."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from trainer import envs
+from trainer.config import load_config
+from trainer.hidden import HiddenStates, hidden_path, save_hidden
+from trainer.motion import joint_points
+from trainer.records import Demo
+from trainer.video import write_webm
+
+STEPS = 250
+FRAMES = 60
+
+
+class Thumbnail:
+    """A real encoder, only small: the frame itself, 8 x 8 grey pixels."""
+
+    name = "thumbnail"
+    dims = 64
+
+    def encode(self, frames: np.ndarray) -> np.ndarray:
+        grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in frames]
+        return np.array(
+            [cv2.resize(g, (8, 8), interpolation=cv2.INTER_AREA).ravel() for g in grey], np.float32
+        )
+
+
+def falling_demo(directory: Path, seed: int = 0) -> Demo:
+    """A hopper that waves its motors and falls, drawn as a stick figure; its states lie beside the video."""
+    env = envs.make("hopper", 1, horizon=STEPS + 1, nthread=0)
+    obs, _ = env.reset(seed=seed)
+    states = [(obs[0], env.qpos[0], env.qvel[0])]
+    actions = 0.8 * np.sin(np.arange(STEPS)[:, None] / 20 + np.array([0.0, 1.0, 2.0]))
+    for action in actions:
+        obs, *_ = env.step(action[None])
+        states.append((obs[0], env.qpos[0], env.qvel[0]))
+    env.close()
+    columns = [np.array(column) for column in zip(*states, strict=True)]
+    hidden = HiddenStates(obs=columns[0], actions=actions, qpos=columns[1], qvel=columns[2])
+    steps = np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)
+    frames = [_stick_figure(hidden.qpos[step]) for step in steps]
+    directory.mkdir(parents=True, exist_ok=True)
+    video = directory / "falling.webm"
+    write_webm(video, frames, fps=30.0)
+    save_hidden(hidden_path(video), hidden)
+    sha256 = hashlib.sha256(video.read_bytes()).hexdigest()
+    return Demo(
+        name="falling", sha256=sha256, path=video, fps=30.0, frames=FRAMES, width=160, height=120,
+        task="backflip",
+    )  # fmt: skip
+
+
+def small_config(**overrides):
+    """Settings under which a whole run takes seconds."""
+    small = {
+        "ratings.pretrain": 12,
+        "ratings.online": 6,
+        "ratings.queue": 4,
+        "rollouts.lanes": 8,
+        "rollouts.steps": 50,
+        "rollouts.total_steps": 2400,
+        "rollouts.threads": 1,
+        "predictor.updates": 60,
+        "predictor.visual_dims": 8,
+    }
+    return load_config(None, small | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def _stick_figure(qpos: np.ndarray) -> np.ndarray:
+    image = np.full((120, 160, 3), 235, np.uint8)
+    points = {k: (80 + 40 * (p[0] - qpos[0]), 105 - 40 * p[1]) for k, p in joint_points(qpos).items()}
+    for a, b in (("top", "hip"), ("hip", "knee"), ("knee", "ankle"), ("heel", "toe")):
+        start, end = (tuple(int(v) for v in points[name]) for name in (a, b))
+        cv2.line(image, start, end, (180, 60, 30), 5, cv2.LINE_AA)
+    return image
