@@ -27,7 +27,7 @@ test-long: .venv/.installed-test
 check: .venv/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --level error --pythonpath $(BIN)/python
 
 clean:
 	rm -rf .venv *.egg-info .pytest_cache .ruff_cache

@@ -311,4 +311,6 @@ def class_weights(counts: torch.Tensor) -> torch.Tensor:
 
 def _linear(inputs: int, outputs: int, bias: bool = True) -> nn.Linear:
     """A layer without values yet: the usual initialisation would draw from torch's global generator."""
-    return nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
+    assert isinstance(layer, nn.Linear)
+    return layer
