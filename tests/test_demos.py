@@ -266,7 +266,7 @@ import resource, sys
 from pathlib import Path
 from trainer.demos import import_video
 from trainer.errors import UserError
-resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
 try:
     import_video(sys.argv[1], name="move", demos_dir=Path(sys.argv[2]))
 except UserError as error:
@@ -285,6 +285,12 @@ def test_a_disk_without_space_is_noticed_and_left_clean(video, library):
     )
     assert "was not written whole: is the disk full?" in done.stdout, done.stderr
     assert list(library.iterdir()) == []
+
+
+def test_a_place_where_nothing_can_be_stored(video, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot store demos in"):
+        import_video(video, name="move", demos_dir=tmp_path / "file" / "demos")
 
 
 # --- the library ----------------------------------------------------------------------------------

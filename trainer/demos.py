@@ -93,8 +93,11 @@ def import_video(
                 return demo
         if name in {demo.name for demo, _ in stored}:
             raise UserError(f"the name {name} is taken by another demo; choose another --name")
-        demos_dir.mkdir(parents=True, exist_ok=True)
-        workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        try:
+            demos_dir.mkdir(parents=True, exist_ok=True)
+            workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        except OSError as error:
+            raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
         workshop.chmod(0o755)  # made for this user alone, but others may read demos
         try:
             video = workshop / "video.webm"

@@ -93,7 +93,8 @@ def demo_features(demo: Demo, encoder: Encoder, cache_dir: Path) -> np.ndarray:
     shape = (demo.frames, encoder.dims)
     if path.exists():
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            # By way of memory: NumPy leaves the file open when the zip directory is damaged.
+            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
                 features = stored["features"]
             if features.shape == shape and features.dtype == np.float32:
                 return features
