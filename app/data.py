@@ -1,0 +1,89 @@
+"""The Data tab: how many ratings there are, by whom, and how to get them."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING
+
+from app.charts import classes_html
+from app.words import ANSWERS
+from trainer.records import Status
+
+if TYPE_CHECKING:
+    from app.session import Session
+
+
+class Data:
+    """The Data tab of one session."""
+
+    title = "Data"
+
+    def __init__(self, session: Session) -> None:
+        self._trainer = session.page.trainer
+        self._shown = False
+        self._text = ""
+        self._html = session.client.gui.add_html("")
+
+    def show(self) -> None:
+        """Counts."""
+        self._shown = True
+        self.refresh(self._trainer.status())
+
+    def hide(self) -> None:
+        """Stops counting."""
+        self._shown = False
+
+    def refresh(self, status: Status) -> None:
+        """Counts again if somebody looks."""
+        if not self._shown:
+            return
+        store, run = self._trainer.store, self._trainer.run
+        counts = count_ratings((row[4], row[6], row[5]) for row in store.iter_ratings(run))
+        text = data_html(run, counts, store.ratings_by_class(run), str(store.path.absolute()))
+        if text != self._text:
+            self._text = self._html.content = text
+
+    def close(self) -> None:
+        """Nothing to do: it holds nothing."""
+
+
+def count_ratings(rows) -> dict[tuple[str, str], list[int]]:
+    """Ratings of 1 to 5 for each rater and stage.
+
+    Args:
+        rows: (rater, stage, value) of each rating.
+    """
+    counts: dict[tuple[str, str], list[int]] = {}
+    for rater, stage, value in rows:
+        counts.setdefault((rater, stage), [0] * 5)[value - 1] += 1
+    return dict(sorted(counts.items()))
+
+
+def data_html(run: str, counts: dict[tuple[str, str], list[int]], classes: list[int], path: str) -> str:
+    """The whole tab."""
+    total = sum(classes)
+    heads = "".join(
+        f'<th scope="col" title="{answer}">{value}</th>' for value, answer in enumerate(ANSWERS, 1)
+    )
+    rows = "".join(
+        f'<tr><th scope="row">{escape(rater)}</th><td>{escape(stage)}</td>'
+        + "".join(f"<td>{count or '·'}</td>" for count in row)
+        + f"<td><b>{sum(row)}</b></td></tr>"
+        for (rater, stage), row in counts.items()
+    )
+    table = (
+        f'<div class="od-scroll"><table><thead><tr><th scope="col">Rater</th><th scope="col">Stage</th>{heads}'
+        f'<th scope="col">All</th></tr></thead><tbody>{rows}</tbody></table></div>'
+        if rows
+        else '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
+    )
+    return (
+        '<article class="od-data"><div class="od-data-top"><div><h1>Ratings</h1>'
+        f"<p>{total} rating{'' if total == 1 else 's'} in run <b>{escape(run)}</b></p></div>"
+        '<a class="od-button od-primary" href="/export.csv" download>Download CSV</a></div>'
+        f"{classes_html(classes)}<section><h3>By rater and stage</h3>{table}</section>"
+        "<section><h3>Where they are</h3><p>Every rating is a row of the view <code>ratings</code> in this "
+        f"SQLite file, which other programs may read while onedemo runs:</p><p><code>{escape(path)}</code></p>"
+        "<p class=od-quiet>The CSV has the same columns, for all runs: one header, times in UTC, "
+        "formula-like cells made harmless.</p></section></article>"
+    )

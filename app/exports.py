@@ -1,0 +1,50 @@
+"""Ratings as CSV, in pieces, safe to open in a spreadsheet."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
+
+from trainer.store import RATING_COLUMNS
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+def defuse(value: object) -> object:
+    """A cell that no spreadsheet takes for a formula: text that looks like one gets an apostrophe.
+
+    Numbers stay as they are.
+    """
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def csv_blocks(rows: Iterable[tuple], *, rows_per_block: int = 500) -> Iterator[bytes]:
+    """The rows as UTF-8 CSV with one header, in blocks.
+
+    Args:
+        rows: In the order of ``trainer.store.RATING_COLUMNS``.
+        rows_per_block: How many rows to put in a block.
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer)
+    writer.writerow(RATING_COLUMNS)
+    for count, row in enumerate(rows, start=1):
+        writer.writerow([defuse(cell) for cell in row])
+        if count % rows_per_block == 0:
+            yield _drain(buffer)
+    if buffer.tell():
+        yield _drain(buffer)
+
+
+def file_name(now: datetime | None = None) -> str:
+    """A name for a download: the day and the time in UTC."""
+    return f"onedemo-ratings-{now or datetime.now(UTC):%Y%m%d-%H%M%S}.csv"
+
+
+def _drain(buffer: io.StringIO) -> bytes:
+    data = buffer.getvalue().encode()
+    buffer.seek(0)
+    buffer.truncate()
+    return data

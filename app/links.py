@@ -1,0 +1,93 @@
+"""Links for people: long tokens derived from one secret file, so that only hashes need storing.
+
+A token is HMAC-SHA256(secret, rater), so the same links are printed at every start although the
+database holds nothing but their SHA-256.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import os
+import secrets
+from pathlib import Path
+
+from trainer.errors import UserError
+from trainer.records import Rater
+from trainer.store import Store
+
+SECRET_FILE = "link-secret"
+SECRET_BYTES = 32
+
+
+def link_token(secret: bytes, rater: Rater) -> str:
+    """The token in a rater's link: 43 URL-safe characters that cannot be guessed without the secret."""
+    digest = hmac.new(secret, f"onedemo link {rater.id} {rater.name}".encode(), hashlib.sha256).digest()
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
+def hash_token(token: str) -> str:
+    """What the database keeps of a token: its SHA-256, hex."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+def new_session_token() -> str:
+    """A fresh random token for a cookie."""
+    return secrets.token_urlsafe(SECRET_BYTES)
+
+
+def read_secret(data_dir: Path) -> bytes:
+    """The secret of a data directory, 32 bytes; made (mode 0600, atomically) if there is none.
+
+    Raises:
+        UserError: If the file cannot be read or written, or is not 32 bytes long.
+    """
+    path = Path(data_dir) / SECRET_FILE
+    try:
+        if not path.exists():
+            _create(path)
+        secret = path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"the secret for links {path} cannot be used ({error.strerror}); check its permissions"
+        ) from None
+    if len(secret) != SECRET_BYTES:
+        raise UserError(
+            f"the secret for links {path} should be {SECRET_BYTES} bytes long, it has {len(secret)}; "
+            "restore it, or delete it to make new links"
+        )
+    return secret
+
+
+def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
+    """The link that lets a rater in, known to the store from now on.
+
+    Args:
+        store: Keeps the hash of the token.
+        secret: From ``read_secret``.
+        rater: Whom the link is for.
+        base_url: Of the front, such as ``http://127.0.0.1:8080``.
+    """
+    token = link_token(secret, rater)
+    store.add_token(hash_token(token), rater.id, "link")
+    return f"{base_url.rstrip('/')}/login?token={token}"
+
+
+def _create(path: Path) -> None:
+    # Written beside its place and linked into it: a reader never sees half a secret, and of two
+    # processes that start at once the first one's secret is kept.
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
+    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(secrets.token_bytes(SECRET_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(draft, path)
+        except FileExistsError:
+            pass
+    finally:
+        draft.unlink()

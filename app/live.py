@@ -1,0 +1,147 @@
+"""The robot acting with the newest policy, in real time, for everybody who watches.
+
+One thread simulates one robot and hands each state to all watchers; while nobody watches it sleeps.
+It keeps no state that training could see.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from trainer import envs
+
+log = logging.getLogger("onedemo.page")
+
+FRAMES_PER_SECOND = 30.0
+_BEHIND_SECONDS = 0.25
+"""If it falls behind by more than this it drops the rest rather than run after it."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Moment:
+    """What a watcher draws."""
+
+    xpos: np.ndarray
+    """Positions of the bodies, (bodies, 3), metres; the robot's own x is taken out."""
+    xmat: np.ndarray
+    """Their orientations, (bodies, 3, 3)."""
+    x: float
+    """Where the robot is along its track, metres."""
+    seconds: float
+    """Since the episode began."""
+    acting: bool
+    """Whether a policy acts, or the robot stands because there is none yet."""
+
+
+Watcher = Callable[[Moment], None]
+
+
+class Live:
+    """The live robot of one run.
+
+    Args:
+        policy: Gives the acting policy, or None while there is none.
+        seconds: Length of an episode: the demo's.
+        environment: Name in the registry of environments.
+    """
+
+    def __init__(self, policy: Callable[[], Any], seconds: float, environment: str = "hopper") -> None:
+        self._policy = policy
+        spec = envs.spec(environment)
+        self.model_path = spec.xml
+        self._dt = spec.dt
+        self._horizon = max(1, round(seconds / spec.dt))
+        self._environment = environment
+        self._watchers: dict[object, Watcher] = {}
+        self._wake = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="onedemo-live", daemon=True)
+        self._thread.start()
+
+    def watch(self, key: object, watcher: Watcher) -> None:
+        """Calls ``watcher`` about 30 times a second, from the live thread, until ``leave``."""
+        with self._wake:
+            self._watchers[key] = watcher
+            self._wake.notify()
+
+    def leave(self, key: object) -> None:
+        """Ends ``watch``."""
+        with self._wake:
+            self._watchers.pop(key, None)
+
+    def close(self) -> None:
+        """Ends the thread."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        self._thread.join(timeout=5)
+
+    def _run(self) -> None:
+        env = envs.make(self._environment, 1, horizon=self._horizon, nthread=0)
+        model = mujoco.MjModel.from_xml_path(str(self.model_path))
+        data = mujoco.MjData(model)
+        obs, _ = env.reset(seed=0)
+        clock, policy = 0, self._policy()
+        due = time.monotonic()
+        while True:
+            with self._wake:
+                while not self._watchers and not self._closing:
+                    self._wake.wait()
+                    due = time.monotonic()
+                if self._closing:
+                    return
+                watchers = list(self._watchers.values())
+            for _ in range(steps_due(time.monotonic() - due, self._dt)):
+                due += self._dt
+                if clock == 0:
+                    policy = self._policy()  # One policy for a whole episode.
+                if policy is None:
+                    clock = (clock + 1) % self._horizon
+                    continue
+                actions = policy.act(obs, np.array([clock]))
+                obs, _, _, ended, _ = env.step(np.asarray(actions))
+                clock = 0 if ended[0] else clock + 1
+            if time.monotonic() - due > self._dt:
+                due = time.monotonic()
+            moment = self._moment(env, model, data, clock, policy is not None)
+            for watcher in watchers:
+                try:
+                    watcher(moment)
+                except Exception:
+                    log.exception("a watcher could not be served")
+            time.sleep(max(0.005, 1 / FRAMES_PER_SECOND - max(0.0, time.monotonic() - due)))
+
+    def _moment(
+        self, env: Any, model: mujoco.MjModel, data: mujoco.MjData, clock: int, acting: bool
+    ) -> Moment:
+        data.qpos[:] = env.qpos[0]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        x = float(data.subtree_com[0, 0])  # What the camera of the clips follows, too.
+        xpos = data.xpos.copy()
+        xpos[1:, 0] -= x
+        return Moment(
+            xpos=xpos,
+            xmat=data.xmat.reshape(-1, 3, 3).copy(),
+            x=x,
+            seconds=clock * self._dt,
+            acting=acting,
+        )
+
+
+def steps_due(behind: float, dt: float) -> int:
+    """How many control steps to make now.
+
+    Args:
+        behind: Seconds between the simulated time and now.
+        dt: Seconds per control step.
+    """
+    return int(min(max(behind, 0.0), _BEHIND_SECONDS) / dt)

@@ -1,0 +1,121 @@
+"""Pictures of the demo for the Watch and Guide tabs: single frames, and examples of ratings.
+
+Both are made once, on first use, and kept encoded (a few megabytes).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from trainer.clips import compose_clip
+from trainer.demos import read_frames
+from trainer.records import Demo
+
+_JPEG_QUALITY = 88
+_MAX_WIDTH = 640
+_CLIP_SECONDS = 0.3
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Example:
+    """Two moments of the demo side by side, and how far they are apart."""
+
+    webp: bytes
+    at: float
+    """Where the left side begins in the demo, seconds."""
+    other: float
+    """Where the right side begins, seconds."""
+
+
+class Pictures:
+    """Encoded pictures of one demo, safe to use from many threads.
+
+    Args:
+        demo: The demo.
+        read: Reads its frames, (n, H, W, 3), uint8 RGB.
+    """
+
+    def __init__(self, demo: Demo, read: Callable[[Demo], np.ndarray] = read_frames) -> None:
+        self.demo = demo
+        self._read = read
+        self._lock = threading.Lock()
+        self._frames: list[bytes] | None = None
+        self._examples: dict[str, Example] = {}
+
+    def frames(self) -> list[bytes]:
+        """Every frame of the demo as JPEG, in order."""
+        with self._lock:
+            if self._frames is None:
+                self._prepare()
+            assert self._frames is not None
+            return self._frames
+
+    def examples(self) -> dict[str, Example]:
+        """Examples "same", "near", "other" and "far": the demo beside itself at growing distance."""
+        with self._lock:
+            if self._frames is None:
+                self._prepare()
+            return self._examples
+
+    def _prepare(self) -> None:
+        frames = self._read(self.demo)
+        length = min(len(frames), max(2, round(_CLIP_SECONDS * self.demo.fps)))
+        moments = example_moments(frames, length=length)
+        examples = {}
+        for name, other in moments.items():
+            start = moments["same"]
+            webp = compose_clip(
+                frames[start : start + length], frames[other : other + length], fps=self.demo.fps
+            )
+            examples[name] = Example(webp=webp, at=start / self.demo.fps, other=other / self.demo.fps)
+        self._examples = examples
+        self._frames = [_jpeg(frame) for frame in frames]
+
+
+def example_moments(frames: np.ndarray, *, length: int) -> dict[str, int]:
+    """Where to begin the examples, chosen by how different the pictures are.
+
+    The left side is the liveliest moment of the demo. The right side is the same moment ("same"), the
+    moment that looks most different ("far"), and those a fifth ("near") and half ("other") as different.
+
+    Args:
+        frames: (n, H, W, 3), uint8.
+        length: Frames in a clip, at least 2.
+
+    Returns:
+        First frames, each at most ``n - length``.
+    """
+    last = len(frames) - length
+    small = np.stack([cv2.resize(frame, (40, 30), interpolation=cv2.INTER_AREA) for frame in frames])
+    small = small.reshape(len(frames), -1).astype(np.float32)
+    motion = np.abs(np.diff(small, axis=0)).mean(1)
+    lively = [motion[start : start + length - 1].sum() for start in range(last + 1)]
+    same = int(np.argmax(lively))
+    window = small[same : same + length]
+    distance = np.array([np.abs(small[s : s + length] - window).mean() for s in range(last + 1)])
+    others = np.where(np.arange(last + 1) == same, np.inf, distance)
+    most = distance.max()
+    return {
+        "same": same,
+        "near": int(np.argmin(np.abs(others - most / 5))),
+        "other": int(np.argmin(np.abs(others - most / 2))),
+        "far": int(np.argmax(distance)),
+    }
+
+
+def _jpeg(frame: np.ndarray) -> bytes:
+    height, width = frame.shape[:2]
+    if width > _MAX_WIDTH:
+        size = (_MAX_WIDTH, round(height * _MAX_WIDTH / width))
+        frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    )
+    if not done:
+        raise RuntimeError("OpenCV could not encode a frame as JPEG")
+    return data.tobytes()

@@ -1,0 +1,240 @@
+"""The Watch tab: the robot live beside the demo, what the trainer does, how it has gone so far."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+from mjviser import ViserMujocoScene
+
+from app import charts
+from app.live import Moment
+from trainer.records import Status
+
+if TYPE_CHECKING:
+    from app.session import Session
+
+_DEMO_HZ = 15.0
+"""How often the demo's frame is exchanged; the robot moves twice as often."""
+_CONFIRM_SECONDS = 5.0
+# As in the clips, so that robot and demo have one scale; the mouse turns it.
+_CAMERA_POSITION = (0.0, -3.0, 1.02)
+_CAMERA_TARGET = (0.0, 0.0, 1.02)
+_CAMERA_FOV = 45.0
+_LIMBS = ((0.91, 0.29, 0.17, 1.0), (0.13, 0.25, 0.47, 1.0), (0.20, 0.48, 0.76, 1.0), (0.97, 0.69, 0.15, 1.0))
+
+_PHASES = {
+    "starting": "Starting",
+    "pretrain": "Waiting for ratings",
+    "online": "Learning",
+    "paused": "Paused",
+    "done": "Done",
+    "stopped": "Stopped",
+    "failed": "Failed",
+}
+
+
+class Watch:
+    """The Watch tab of one session."""
+
+    title = "Watch"
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._client = session.client
+        self._trainer = session.page.trainer
+        self._live = session.page.live
+        self._demo = self._trainer.demo
+        self._lock = threading.RLock()
+        self._scene: ViserMujocoScene | None = None
+        self._frame = -1
+        self._confirm_until = 0.0
+        self._commands: list[Any] = []
+        self._shown = False
+        self._content: dict[int, str] = {}
+        gui = session.client.gui
+        self._strip = gui.add_html("")
+        gui.add_html(_ROBOT)
+        self._picture = gui.add_html("")
+        self._time = gui.add_html("")
+        gui.add_html(_preload(self._demo.frames))
+        self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
+        self._classes = gui.add_html("")
+        self._put(self._picture, frame_html(0))
+        self._put(self._time, time_html(0, self._demo.seconds, True))
+
+    def show(self) -> None:
+        """Starts the live robot and the keys."""
+        with self._lock:
+            self._shown = True
+            if self._scene is None:
+                self._build_scene()
+            self._live.watch(self._client.client_id, self._draw)
+            self._key("Pause or resume training", "P", self._toggle)
+            self._key("Stop training", "X", self._stop)
+            self.refresh(self._trainer.status())
+
+    def hide(self) -> None:
+        """Stops them."""
+        with self._lock:
+            self._shown = False
+            self._live.leave(self._client.client_id)
+            for command in self._commands:
+                command.remove()
+            self._commands.clear()
+
+    def refresh(self, status: Status) -> None:
+        """Counters and curves."""
+        with self._lock:
+            if not self._shown:
+                return
+            self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until))
+            self._charts.extend(self._trainer.store.iterations(self._trainer.run, after=self._charts.last))
+            self._put(
+                self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
+            )
+
+    def close(self) -> None:
+        """Leaves the live robot."""
+        self._live.leave(self._client.client_id)
+
+    # Controls
+
+    def _key(self, label: str, hotkey: Any, action: Any) -> None:
+        command = self._client.gui.add_command(label, hotkey=hotkey, modifier="alt")
+        command.on_trigger(lambda _: action())
+        self._commands.append(command)
+
+    def _toggle(self) -> None:
+        if self._trainer.status().phase in ("paused", "failed"):
+            self._trainer.resume()
+        else:
+            self._trainer.pause()
+        self.refresh(self._trainer.status())
+
+    def _stop(self) -> None:
+        # Stopping takes a second press: it cannot be taken back from here.
+        with self._lock:
+            sure = time.monotonic() < self._confirm_until
+            self._confirm_until = 0.0 if sure else time.monotonic() + _CONFIRM_SECONDS
+        if sure:
+            self._trainer.stop()
+        self.refresh(self._trainer.status())
+
+    # The robot
+
+    def _build_scene(self) -> None:
+        # A model of its own, as the scene writes into it; without the floor, which is drawn calmer here.
+        scene = ViserMujocoScene(self._client, drawn_model(self._live.model_path), num_envs=1)  # type: ignore[arg-type]
+        scene.camera_tracking_enabled = False
+        self._client.scene.add_grid(
+            "/fixed_bodies/floor",
+            infinite_grid=True,
+            cell_size=0.5,
+            section_size=1.0,
+            cell_color=(206, 214, 223),
+            section_color=(182, 193, 205),
+            fade_distance=22.0,
+            shadow_opacity=0.22,
+            plane_opacity=0.0,
+        )
+        camera = self._client.camera
+        camera.up_direction = (0.0, 0.0, 1.0)
+        camera.position = _CAMERA_POSITION
+        camera.look_at = _CAMERA_TARGET
+        camera.fov = math.radians(_CAMERA_FOV)
+        self._scene = scene
+
+    def _draw(self, moment: Moment) -> None:
+        scene = self._scene
+        if scene is None:
+            return
+        with self._client.atomic():
+            scene.update_from_arrays(moment.xpos[None], moment.xmat[None])
+            scene.fixed_bodies_frame.position = (-moment.x, 0.0, 0.0)
+            frame = min(int(moment.seconds * self._demo.fps), self._demo.frames - 1)
+            if frame // max(1, round(self._demo.fps / _DEMO_HZ)) != self._frame:
+                self._frame = frame // max(1, round(self._demo.fps / _DEMO_HZ))
+                self._put(self._picture, frame_html(frame))
+                self._put(self._time, time_html(moment.seconds, self._demo.seconds, moment.acting))
+        self._client.flush()
+
+    def _put(self, handle: Any, content: str) -> None:
+        if self._content.get(id(handle)) != content:
+            self._content[id(handle)] = content
+            handle.content = content
+
+
+_ROBOT = '<figure class="od-view od-robot"><figcaption>Robot, live</figcaption><div></div></figure>'
+
+
+def strip_html(status: Status, confirming: bool) -> str:
+    """What the trainer does, in figures, and its controls."""
+    running = status.phase in ("starting", "pretrain", "online")
+    ended = status.phase in ("done", "stopped")
+    figures = [
+        ("Iteration", f"{status.iteration:,}", ""),
+        ("Steps", f"{_short(status.env_steps)}", f"of {_short(status.total_steps)}"),
+        ("Speed", f"{status.steps_per_s:,.0f}", "steps/s"),
+        ("Predictor", f"{status.snapshot}" if status.snapshot else "–", "snapshot"),
+        ("Ratings", f"{status.ratings}", f"of {status.target_ratings}"),
+    ]
+    cells = "".join(f"<div><dt>{n}</dt><dd>{v} <small>{u}</small></dd></div>" for n, v, u in figures)
+    toggle = "Pause" if running else "Try again" if status.phase == "failed" else "Resume"
+    off = " disabled" if ended else ""
+    stop = "Press again to stop" if confirming else "Stop"
+    return (
+        f'<div class="od-strip"><div class="od-state" data-phase="{escape(status.phase)}">'
+        f"<b>{_PHASES.get(status.phase, escape(status.phase))}</b><span>{escape(status.message)}</span></div>"
+        f'<dl class="od-figures">{cells}</dl><div class="od-controls">'
+        f'<button type="button" class="od-button" data-key="alt+p"{off}>{toggle}</button>'
+        f'<button type="button" class="od-button od-danger" data-key="alt+x"{off}>{stop}</button></div></div>'
+    )
+
+
+def frame_html(frame: int) -> str:
+    """One frame of the demo; ``decoding=sync`` paints it without a gap."""
+    return (
+        '<figure class="od-view od-demonstration"><figcaption>Demonstration</figcaption>'
+        f'<div><img src="/demo/frames/{frame}.jpg" alt="" decoding="sync"></div></figure>'
+    )
+
+
+def time_html(seconds: float, length: float, acting: bool) -> str:
+    """Where in the move both are."""
+    share = min(1.0, seconds / length) if length else 0.0
+    note = "" if acting else "The robot stands still: there is no policy yet."
+    return (
+        f'<div class="od-time"><i><i style="width:{100 * share:.1f}%"></i></i>'
+        f"<span>{seconds:.1f} s of {length:.1f} s</span><em>{note}</em></div>"
+    )
+
+
+def _preload(frames: int) -> str:
+    # Once fetched they stay in the browser's memory as long as these elements are there.
+    images = "".join(f'<img src="/demo/frames/{n}.jpg" alt="">' for n in range(frames))
+    return f'<div class="od-preload" aria-hidden="true">{images}</div>'
+
+
+def _short(steps: int) -> str:
+    if steps >= 1_000_000:
+        return f"{steps / 1_000_000:.2f} M"
+    return f"{steps / 1000:.0f} k" if steps >= 10_000 else f"{steps}"
+
+
+def drawn_model(path: Path) -> mujoco.MjModel:
+    """The robot without its floor, each limb in the colour it has in the clips."""
+    spec = mujoco.MjSpec.from_file(str(path))
+    for geom in list(spec.geoms):
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            spec.delete(geom)
+    model = spec.compile()
+    for geom in range(model.ngeom):
+        model.geom_matid[geom] = -1
+        model.geom_rgba[geom] = _LIMBS[min(geom, len(_LIMBS) - 1)]
+    return model

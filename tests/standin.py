@@ -1,0 +1,110 @@
+"""A trainer that does not learn, for tests of the page: the real store, real clips, a given status."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from trainer.records import Demo, Segment, Status
+from trainer.store import NewClip, Store
+
+FPS = 30.0
+SIZE = (360, 480)
+
+
+def drawn_frames(count: int, phase: float = 0.0) -> np.ndarray:
+    """A stick that turns: cheap pictures that differ from frame to frame."""
+    import cv2
+
+    frames = np.full((count, *SIZE, 3), (236, 239, 243), np.uint8)
+    for index, frame in enumerate(frames):
+        angle = phase + 2 * np.pi * index / 60
+        centre = np.array([240.0, 190.0])
+        tip = centre + 110 * np.array([np.cos(angle), np.sin(angle)])
+        frame[300:] = (214, 219, 226)
+        cv2.line(
+            frame, tuple(int(v) for v in centre), tuple(int(v) for v in tip), (47, 93, 196), 22, cv2.LINE_AA
+        )
+        cv2.circle(frame, tuple(int(v) for v in centre), 18, (232, 150, 60), -1, cv2.LINE_AA)
+    return frames
+
+
+class Acting:
+    """Holds still with a wobble."""
+
+    def act(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
+        return 0.6 * np.sin(clock[:, None] / 20 + np.arange(3)) + 0 * obs[:, :3]
+
+
+class StandIn:
+    """What the page needs of a trainer."""
+
+    def __init__(self, data_dir: Path, *, clips: int = 12, target: int = 200) -> None:
+        self.store = Store(data_dir)
+        self.run = "backflip-1"
+        self.directory = data_dir / "runs" / self.run / "clips"
+        self.directory.mkdir(parents=True)
+        self.demo = Demo(
+            name="hopper-backflip", sha256="0" * 64, path=data_dir / "demo.mp4", fps=FPS, frames=240,
+            width=480, height=360, task="backflip",
+        )  # fmt: skip
+        self.store.add_run(
+            run=self.run, demo=self.demo.name, demo_sha256="0" * 64, seed=0, config="", version="0"
+        )
+        self.frames = drawn_frames(self.demo.frames)
+        self._lock = threading.Lock()
+        self._status = Status(
+            phase="pretrain",
+            message="The robot is waiting for your first ratings.",
+            target_ratings=target,
+            total_steps=2_000_000,
+        )
+        self.calls: list[str] = []
+        self.add_clips(clips)
+
+    def add_clips(self, count: int) -> list[int]:
+        from trainer.clips import compose_clip
+
+        zeros = Segment(
+            obs=np.zeros((38, 11)), actions=np.zeros((38, 3)), qpos=np.zeros((38, 6)), qvel=np.zeros((38, 6))
+        )
+        new = [
+            NewClip(demo_step=38 * i % 900, segment=zeros, stage="pretrain", iteration=0)
+            for i in range(count)
+        ]
+        ids = [clip.id for clip in self.store.add_clips(self.run, new)]
+        for number in ids:
+            start = number * 9 % 200
+            webp = compose_clip(self.frames[start : start + 10], drawn_frames(10, phase=number), fps=FPS)
+            self.clip_file(number).write_bytes(webp)
+        self.store.set_clip_state(ids, "ready")
+        return ids
+
+    def set_status(self, **changes) -> None:
+        with self._lock:
+            self._status = replace(self._status, **changes)
+
+    def status(self) -> Status:
+        with self._lock:
+            return self._status
+
+    def clip_file(self, clip_id: int) -> Path:
+        return self.directory / f"{clip_id:06d}.webp"
+
+    def acting_policy(self):
+        return Acting()
+
+    def pause(self) -> None:
+        self.calls.append("pause")
+        self.set_status(phase="paused")
+
+    def resume(self) -> None:
+        self.calls.append("resume")
+        self.set_status(phase="online")
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+        self.set_status(phase="stopped")
