@@ -60,7 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     serve = _command(commands, "serve", _serve, "the web app with its trainer thread")
     _run_options(serve)
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (127.0.0.1)")
-    serve.add_argument("--port", type=int, default=8080, help="port of the web page (8080)")
+    serve.add_argument("--port", type=_port, default=8080, help="port of the web page (8080)")
     serve.add_argument("--new-run", action="store_true", help="start over instead of going on")
 
     train = _command(commands, "train", _train, "the same trainer without a browser, rated by a program")
@@ -313,6 +313,12 @@ def _crop(text: str) -> tuple[int, int, int, int]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"must be four whole numbers X,Y,W,H, got {text!r}") from None
     return x, y, width, height
+
+
+def _port(text: str) -> int:
+    if not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 to 65535, got {text!r}")
+    return int(text)
 
 
 def _version() -> str:

@@ -53,9 +53,10 @@ def train(
     began = time.monotonic()
     hidden_file = hidden_path(demo.path)
     hidden = load_hidden(hidden_file) if hidden_file.exists() else None
-    run, config = open_run(store, data_dir, demo, config, name=name, resume=name is not None)
-    budget = config.ratings.pretrain + config.ratings.online - sum(store.ratings_by_class(run))
+    given = sum(store.ratings_by_class(name)) if name else 0
+    budget = config.ratings.pretrain + config.ratings.online - given
     simulated = make_rater(rater, hidden, demo=demo.name, budget=budget)
+    run, config = open_run(store, data_dir, demo, config, name=name, resume=name is not None)
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate),
