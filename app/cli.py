@@ -112,7 +112,13 @@ def _parser() -> argparse.ArgumentParser:
     trpo.add_argument("--task", choices=("backflip", "hop"), default="backflip")
     trpo.add_argument("--steps", type=int, default=3_000_000, help="control steps (3 million)")
     trpo.add_argument("--seed", type=int, default=0)
-    trpo.add_argument("--out", type=Path, required=True, help="the best episode's states: PREFIX.hidden.npz")
+    trpo.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="PREFIX",
+        help="where to write PREFIX.json, .policy.pt and .hidden.npz",
+    )
     return parser
 
 
@@ -241,13 +247,9 @@ def _demo_list(arguments: argparse.Namespace) -> None:
 
 
 def _demo_show(arguments: argparse.Namespace) -> None:
-    import dataclasses
+    from trainer.demos import find_demo, show
 
-    from trainer.demos import find_demo
-
-    demo = find_demo(arguments.name, arguments.data_dir / "demos")
-    for key, value in dataclasses.asdict(demo).items():
-        print(f"{key:8} {value}")
+    print(show(find_demo(arguments.name, arguments.data_dir / "demos")))
 
 
 def _rater_add(arguments: argparse.Namespace) -> None:
@@ -292,9 +294,15 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _baseline_trpo(arguments: argparse.Namespace) -> None:
-    from trainer.baselines.handcoded import train_handcoded
+    from dataclasses import asdict
 
-    train_handcoded(arguments.task, steps=arguments.steps, seed=arguments.seed, out=arguments.out)
+    from trainer.baselines.handcoded import HandcodedConfig, save_result, train_handcoded
+
+    config = HandcodedConfig(task=arguments.task, steps=arguments.steps, seed=arguments.seed)
+    result = train_handcoded(config)
+    save_result(arguments.out, result)
+    for key, value in asdict(result.best_score).items():
+        print(f"{key:18} {value:g}")
 
 
 def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
