@@ -2,7 +2,7 @@
 
 Drawn here with arrays and not by MuJoCo, because the floor costs its software renderer 5 ms a
 frame at 480 x 360 (12 ms smoothed) and shimmers in the distance. Here each pixel holds the exact
-mean of the pattern over its footprint, so the floor is calm, and a frame costs 2 ms.
+mean of the pattern over its footprint, so the floor is calm, at 3 ms, and 2 more for the shadow.
 
 Shapes: H rows, W columns, h rows below the horizon, L limbs. World axes as in MuJoCo: x along the
 robot's track, y away from the camera, z up, in metres. The camera looks along +y, level.

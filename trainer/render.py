@@ -1,7 +1,7 @@
 """Pictures of the robot from stored positions, without a screen, and which frame shows which step.
 
 The robot alone is drawn by MuJoCo, at twice the size and then averaged down (smooth edges at a
-third of the price of multisampling); sky, floor and shadow come from ``trainer.backdrop``.
+half of the price of multisampling); sky, floor and shadow come from ``trainer.backdrop``.
 The camera follows the robot along the track but keeps its height, so that a jump is seen as one;
 it rises only when the robot would leave the picture.
 
