@@ -106,7 +106,7 @@ class Live:
                 if policy is None:
                     clock = (clock + 1) % self._horizon
                     continue
-                actions = policy.act(obs, np.array([clock]))
+                actions = policy.act(policy.inputs(obs, np.array([clock])))
                 obs, _, _, ended, _ = env.step(np.asarray(actions))
                 clock = 0 if ended[0] else clock + 1
             if time.monotonic() - due > self._dt:

@@ -35,8 +35,11 @@ def drawn_frames(count: int, phase: float = 0.0) -> np.ndarray:
 class Acting:
     """Holds still with a wobble."""
 
-    def act(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
-        return 0.6 * np.sin(clock[:, None] / 20 + np.arange(3)) + 0 * obs[:, :3]
+    def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
+        return clock[:, None]
+
+    def act(self, inputs: np.ndarray) -> np.ndarray:
+        return 0.6 * np.sin(inputs / 20 + np.arange(3))
 
 
 class StandIn:
