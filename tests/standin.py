@@ -45,7 +45,7 @@ class Acting:
 class StandIn:
     """What the page needs of a trainer."""
 
-    def __init__(self, data_dir: Path, *, clips: int = 12, target: int = 200) -> None:
+    def __init__(self, data_dir: Path, *, clips: int = 8, target: int = 200) -> None:
         self.store = Store(data_dir)
         self.run = "backflip-1"
         self.directory = data_dir / "runs" / self.run / "clips"

@@ -15,6 +15,12 @@ def features():
     return np.random.default_rng(0).normal(size=(FRAMES, 20)).cumsum(axis=0).astype(np.float32)
 
 
+def make_learner(features, config=None):
+    learner = Learner(config or small_config(), FRAMES, 30.0)
+    learner.look_at(features)
+    return learner
+
+
 def rated(learner, count=20, seed=0):
     """Ratings of random clips by a fixed rule: the more the foot points down, the better."""
     rollouts = learner.random_rollouts()
@@ -28,26 +34,26 @@ def rated(learner, count=20, seed=0):
 
 
 def test_time(features):
-    learner = Learner(small_config(), features, 30.0)
+    learner = make_learner(features)
     assert learner.demo_steps == STEPS
     assert learner.clip_steps == 38
     assert learner.frames_of(np.array([0, 4, 5, 125, 249, 400])).tolist() == [0, 0, 1, 30, 59, 59]
 
 
-def test_a_demo_shorter_than_a_clip_is_refused(features):
+def test_a_demo_shorter_than_a_clip_is_refused():
     with pytest.raises(UserError, match="shorter than a clip"):
-        Learner(small_config(), features[:8], 30.0)
+        Learner(small_config(), 8, 30.0)
 
 
 def test_the_random_rollouts_are_the_same_each_time(features):
-    learner = Learner(small_config(), features, 30.0)
+    learner = make_learner(features)
     one, two = learner.random_rollouts(), learner.random_rollouts()
     np.testing.assert_array_equal(one.qpos, two.qpos)
     assert one.clock.shape == (16, STEPS) and one.clock[:, 0].max() == 0
 
 
 def test_predicted_rating_of_a_clip_is_the_mean_over_its_steps(features):
-    learner = Learner(small_config(), features, 30.0)
+    learner = make_learner(features)
     ratings = rated(learner)
     snapshot, _ = learner.fit(ratings, 1)
     one = ratings[0]
@@ -66,7 +72,7 @@ def test_practice_raises_the_predicted_rating(features):
     config = small_config(
         rollouts__lanes=16, rollouts__steps=125, rollouts__total_steps=10**6, predictor__updates=200
     )
-    learner = Learner(config, features, 30.0)
+    learner = make_learner(features, config)
     snapshot, _ = learner.fit(rated(learner, 40), 1)
 
     def whole_episodes():
@@ -82,25 +88,25 @@ def test_practice_raises_the_predicted_rating(features):
 
 def test_a_resumed_learner_does_what_the_uninterrupted_one_does(features, tmp_path):
     config = small_config()
-    ratings = rated(Learner(config, features, 30.0))
+    ratings = rated(make_learner(features, config))
 
     def curves(learner, count):
         snapshot, _ = learner.fit(ratings, 1)
         return [learner.iterate(snapshot)[1] for _ in range(count)]
 
-    whole = Learner(config, features, 30.0)
+    whole = make_learner(features, config)
     expected = curves(whole, 5)
-    first = Learner(config, features, 30.0)
+    first = make_learner(features, config)
     curves(first, 2)
     torch.save(first.state_dict(), tmp_path / "state.pt")
-    second = Learner(config, features, 30.0)
+    second = make_learner(features, config)
     second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     assert curves(second, 3) == expected[2:]
     assert (second.iteration, second.env_steps) == (whole.iteration, whole.env_steps)
 
 
 def test_the_last_iteration_ends_at_the_limit(features):
-    learner = Learner(small_config(rollouts__total_steps=900), features, 30.0)
+    learner = make_learner(features, small_config(rollouts__total_steps=900))
     snapshot, _ = learner.fit(rated(learner), 1)
     steps = []
     while learner.env_steps < 900:

@@ -33,28 +33,28 @@ class Learner:
 
     Args:
         config: The run's settings.
-        features: Frame features of the demo, (F, D).
+        frames: How many frames the demo has, F.
         fps: Frames per second of the demo.
 
     Raises:
         UserError: If the demo is shorter than a clip.
     """
 
-    def __init__(self, config: RunConfig, features: np.ndarray, fps: float) -> None:
+    def __init__(self, config: RunConfig, frames: int, fps: float) -> None:
         spec = envs.spec(config.env)
         self.config = config
         self.dt = spec.dt
-        self.demo_steps = int(len(features) / fps / spec.dt + 1e-6)
+        self.demo_steps = int(frames / fps / spec.dt + 1e-6)
         self.clip_steps = int(config.ratings.clip_seconds / spec.dt + 0.5)
         if self.demo_steps < self.clip_steps:
             raise UserError(
-                f"the demo lasts {len(features) / fps:.2f} s, shorter than a clip of "
+                f"the demo lasts {frames / fps:.2f} s, shorter than a clip of "
                 f"{config.ratings.clip_seconds} s; use a longer video or a smaller ratings.clip_seconds"
             )
         self.iteration = 0
         self.env_steps = 0
-        self._visual = visual_inputs(features, config.predictor.visual_dims)
-        self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, len(features))
+        self._visual: np.ndarray | None = None
+        self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
         self._policy = Policy(
             config.policy,
             obs_size=spec.obs_size,
@@ -64,6 +64,10 @@ class Learner:
         )
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed)
         self._collector = self._make_collector(config.rollouts.lanes, seed=config.seed, stagger=True)
+
+    def look_at(self, features: np.ndarray) -> None:
+        """Takes in the demo's frame features, (F, D). Random rollouts and clips need none; fits do."""
+        self._visual = visual_inputs(features, self.config.predictor.visual_dims)
 
     def policy(self) -> PolicySnapshot:
         """The current policy, as a copy that any thread may use."""
@@ -92,6 +96,7 @@ class Learner:
         Raises:
             ValueError: If there is none.
         """
+        assert self._visual is not None, "look_at comes before fit"
         steps = np.array([r.demo_step for r in ratings])[:, None] + np.arange(self.clip_steps)
         return fit(
             ratings,

@@ -182,13 +182,11 @@ class Trainer:
 
     def _prepare(self) -> Learner:
         torch.set_num_threads(self.config.rollouts.threads)
-        features = demo_features(self.demo, self._encoder, self.data_dir / "demos")
-        learner = Learner(self.config, features, self.demo.fps)
-        saved = self._load_checkpoint(learner)
+        learner = Learner(self.config, self.demo.frames, self.demo.fps)
+        if not self._load_checkpoint(learner):
+            self._pool = learner.random_rollouts()
         self._learner = learner
         self._policy = learner.policy()
-        if not saved:
-            self._pool = learner.random_rollouts()
         self._load_snapshot()
         if self._renderer is not None:
             self._clips = ClipMaker(
@@ -200,6 +198,9 @@ class Trainer:
                 renderer=self._renderer,
             )
             self._clips.recover(self.run)
+        if self._simulated is None:
+            self._ask(learner)  # people rate while the encoder looks at the demo, seconds the first time
+        learner.look_at(demo_features(self.demo, self._encoder, self.data_dir / "demos"))
         return learner
 
     def _iterate(self, learner: Learner) -> None:
