@@ -235,7 +235,9 @@ def _demo_add(arguments: argparse.Namespace) -> None:
         mirror=arguments.mirror,
         fps=arguments.fps,
     )
-    print(f"added {demo.name}: {demo.seconds:.1f} s, {demo.frames} frames, {demo.width}x{demo.height}")
+    if demo.name != arguments.name:
+        print(f"this video with these options is known already, as {demo.name}")
+    print(f"{demo.name}: {demo.seconds:.1f} s, {demo.frames} frames, {demo.width}x{demo.height}")
     print(f"learn it with: onedemo serve --demo {demo.name} --data-dir {arguments.data_dir}")
 
 

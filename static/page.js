@@ -89,6 +89,11 @@
     }
   });
 
+  // Viser gives its slider no name.
+  document.addEventListener("focusin", (event) => {
+    if (event.target.matches?.(".mantine-Slider-thumb")) event.target.setAttribute("aria-label", "Rating");
+  });
+
   // Viser connects only with WebGL. Without it, say so instead of showing an empty page.
   function webgl() {
     try {

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from trainer.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
-from trainer.render import HEIGHT, WIDTH, Renderer, RenderThread, frame_of_step, steps_of_frames
+from trainer.render import HEIGHT, WIDTH, Renderer, RenderThread
+from trainer.timing import frame_of_step, steps_of_frames
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
 REPO = Path(__file__).resolve().parent.parent

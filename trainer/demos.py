@@ -27,6 +27,7 @@ from trainer.demo_checks import SourceWatch, check_length, check_name, check_opt
 from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.records import Demo
+from trainer.timing import steps_of_frames
 from trainer.video import VideoReader, resample, write_webm
 
 BUILT_IN = Path(__file__).resolve().parent.parent / "static" / "demos"
@@ -164,7 +165,7 @@ def render_demo(
     Raises:
         UserError: If the name is not allowed or this machine cannot draw.
     """
-    from trainer.render import Renderer, steps_of_frames  # here: listing demos needs no GL
+    from trainer.render import Renderer  # here: listing demos needs no GL
 
     check_name(name)
     count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)

@@ -20,9 +20,9 @@ from trainer.errors import UserError
 from trainer.policy import Policy, PolicySnapshot
 from trainer.predictor import FitStats, Snapshot, fit, visual_inputs
 from trainer.records import Segment
-from trainer.render import frame_of_step
 from trainer.rollouts import Collector, Transitions
 from trainer.store import RatedSegment
+from trainer.timing import frame_of_step
 from trainer.trpo import Trpo
 
 _RANDOM_LANES = 16

@@ -1,4 +1,4 @@
-"""Pictures of the robot from stored positions, without a screen, and which frame shows which step.
+"""Pictures of the robot from stored positions, without a screen.
 
 The robot alone is drawn by MuJoCo, at twice the size and then averaged down (smooth edges at a
 half of the price of multisampling); sky, floor and shadow come from ``trainer.backdrop``.
@@ -38,37 +38,6 @@ _CAMERA_HEIGHT = 0.88
 _FREE_ABOVE = 0.95  # the robot may rise this far above the camera before the camera follows
 
 T = TypeVar("T")
-
-
-def frame_of_step(step: int | np.ndarray, dt: float, fps: float, n_frames: int) -> np.ndarray:
-    """The frame on screen at a control step: ``floor(step * dt * fps)``, within the video.
-
-    Args:
-        step: Control step or steps, any shape.
-        dt: Seconds per control step.
-        fps: Frames per second.
-        n_frames: How many frames the video has.
-
-    Returns:
-        Frame indices in 0..n_frames - 1, the shape of ``step``, int64.
-    """
-    # A step that falls exactly on a frame must not miss it by a rounding error (0.008 * 125 * 30).
-    frame = np.floor(np.asarray(step) * (dt * fps) + 1e-9).astype(np.int64)
-    return np.clip(frame, 0, n_frames - 1)
-
-
-def steps_of_frames(n: int, dt: float, fps: float) -> np.ndarray:
-    """The control step that each of the first ``n`` frames shows: the nearest in time.
-
-    Args:
-        n: How many frames.
-        dt: Seconds per control step.
-        fps: Frames per second.
-
-    Returns:
-        Control steps, (n,), int64.
-    """
-    return np.floor(np.arange(n) / (fps * dt) + 0.5).astype(np.int64)
 
 
 class Renderer:
