@@ -23,7 +23,7 @@ class ClipMaker:
 
     Args:
         store: Holds the segments; is told when a picture is there.
-        directory: Where the pictures go, ``<clip id>.webp``.
+        file: Where the picture of a clip goes, by its number.
         frames: The demo's frames, (F, H, W, 3), uint8.
         fps: Frames per second of the demo.
         frames_of: Demo frame at given control steps.
@@ -33,25 +33,17 @@ class ClipMaker:
     def __init__(
         self,
         store: Store,
-        directory: Path,
         *,
+        file: Callable[[int], Path],
         frames: np.ndarray,
         fps: float,
         frames_of: Callable[[np.ndarray], np.ndarray],
         renderer: RenderThread,
     ) -> None:
         self._store = store
-        self._directory = directory
+        self._file = file
         self._frames, self._fps, self._frames_of = frames, fps, frames_of
         self._renderer = renderer
-
-    def file(self, clip_id: int) -> Path:
-        """Where the picture of a clip is, or will be."""
-        return self._directory / f"{clip_id:06d}.webp"
-
-    def slow_file(self, clip_id: int) -> Path:
-        """Where its slow-motion variant is, or will be."""
-        return self._directory / f"{clip_id:06d}.slow.webp"
 
     def submit(self, clips: list[Clip]) -> list[Future[None]]:
         """Queues clips; each becomes "ready" when its picture is on disk."""
@@ -61,7 +53,7 @@ class ClipMaker:
 
     def recover(self, run: str) -> None:
         """After a restart: queues what was cut but never drawn, and what lost its picture."""
-        lost = [c for c in self._store.waiting_clips(run) if not self.file(c.id).exists()]
+        lost = [c for c in self._store.waiting_clips(run) if not self._file(c.id).exists()]
         self._store.set_clip_state([c.id for c in lost], "cut")
         self.submit(self._store.waiting_clips(run, state="cut"))
 
@@ -73,7 +65,7 @@ class ClipMaker:
             )
             agent = renderer.render(segment.qpos[first])
             demo = self._frames[index]
-            write_atomic(self.file(clip.id), compose_clip(demo, agent, fps=self._fps))
+            write_atomic(self._file(clip.id), compose_clip(demo, agent, fps=self._fps))
             self._store.set_clip_state([clip.id], "ready")
         except Exception:
             log.exception("clip %d could not be drawn", clip.id)

@@ -11,6 +11,9 @@ from pathlib import Path
 
 from trainer.errors import UserError
 
+_UMASK = os.umask(0)  # there is no way to ask without setting; once, before there are threads
+os.umask(_UMASK)
+
 
 def write_atomic(path: Path, data: bytes) -> None:
     """Writes a file to a temporary name, syncs and renames it: a reader never sees half of it.
@@ -26,7 +29,7 @@ def write_atomic(path: Path, data: bytes) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            os.fchmod(handle, 0o666 & ~_umask())  # mkstemp makes files that nobody else can read
+            os.fchmod(handle, 0o666 & ~_UMASK)  # mkstemp makes files that nobody else can read
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -39,12 +42,6 @@ def write_atomic(path: Path, data: bytes) -> None:
         os.fsync(directory)  # the rename itself must survive a power cut
     finally:
         os.close(directory)
-
-
-def _umask() -> int:
-    mask = os.umask(0)  # there is no way to ask without setting
-    os.umask(mask)
-    return mask
 
 
 @contextmanager

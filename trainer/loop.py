@@ -191,7 +191,7 @@ class Trainer:
         if self._renderer is not None:
             self._clips = ClipMaker(
                 self.store,
-                self.directory / "clips",
+                file=self.clip_file,
                 frames=read_frames(self.demo),
                 fps=self.demo.fps,
                 frames_of=learner.frames_of,
