@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -15,7 +16,9 @@ from trainer.records import Clip
 from trainer.render import Renderer, RenderThread
 from trainer.store import Store
 
-log = logging.getLogger(__name__)
+log = logging.getLogger("onedemo")
+
+_RETRY_S = 5.0
 
 
 class ClipMaker:
@@ -44,12 +47,22 @@ class ClipMaker:
         self._file = file
         self._frames, self._fps, self._frames_of = frames, fps, frames_of
         self._renderer = renderer
+        self._failed: list[Clip] = []
+        self._failed_at = 0.0
+        self.error = ""
+        """Why the last clip could not be drawn, one sentence; "" if it could."""
 
     def submit(self, clips: list[Clip]) -> list[Future[None]]:
         """Queues clips; each becomes "ready" when its picture is on disk."""
         return [
             self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip)) for clip in clips
         ]
+
+    def retry(self) -> None:
+        """Queues the clips that failed once more, a few seconds after: a full disk may have room now."""
+        if self._failed and time.monotonic() - self._failed_at > _RETRY_S:
+            failed, self._failed = self._failed, []
+            self.submit(failed)
 
     def recover(self, run: str) -> None:
         """After a restart: queues what was cut but never drawn, and what lost its picture."""
@@ -67,6 +80,9 @@ class ClipMaker:
             demo = self._frames[index]
             write_atomic(self._file(clip.id), compose_clip(demo, agent, fps=self._fps))
             self._store.set_clip_state([clip.id], "ready")
-        except Exception:
+            self.error = ""
+        except Exception as error:
             log.exception("clip %d could not be drawn", clip.id)
-            raise
+            self.error = f"clip {clip.id} could not be drawn: {error}"
+            self._failed_at = time.monotonic()
+            self._failed.append(clip)

@@ -130,7 +130,8 @@ class Trainer:
             gone = time.monotonic() - self._iteration_began
             next_clips = max(1.0, self._iteration_s - gone)
         ratings = sum(self.store.ratings_by_class(self.run))
-        return replace(self._status, ratings=ratings, next_clips_s=next_clips)
+        error = self._status.error or (self._clips.error if self._clips is not None else "")
+        return replace(self._status, ratings=ratings, next_clips_s=next_clips, error=error)
 
     def clip_file(self, clip_id: int) -> Path:
         """The animated picture of a clip; it is there once the clip is "ready"."""
@@ -245,6 +246,8 @@ class Trainer:
         After pretraining the first online clips wait for the first iteration, unless none will come
         because the trainer is ``resting``.
         """
+        if self._clips is not None:
+            self._clips.retry()
         if self._pool is None:  # resumed: the first iteration brings them
             return
         given, missing = self._ratings(), 0
