@@ -105,4 +105,5 @@ def classes_html(counts: list[int]) -> str:
         f"<em>{count}</em></li>"
         for value, (answer, count) in enumerate(zip(ANSWERS, counts, strict=True), start=1)
     )
-    return f'<section class="od-classes"><h3>Ratings by class <small>{total} in all</small></h3><ul>{rows}</ul></section>'
+    heading = f"<h3>Ratings by class <small>{total} in all</small></h3>"
+    return f'<section class="od-classes">{heading}<ul>{rows}</ul></section>'

@@ -72,8 +72,8 @@ def data_html(run: str, counts: dict[tuple[str, str], list[int]], classes: list[
         for (rater, stage), row in counts.items()
     )
     table = (
-        f'<div class="od-scroll"><table><thead><tr><th scope="col">Rater</th><th scope="col">Stage</th>{heads}'
-        f'<th scope="col">All</th></tr></thead><tbody>{rows}</tbody></table></div>'
+        '<div class="od-scroll"><table><thead><tr><th scope="col">Rater</th><th scope="col">Stage</th>'
+        f'{heads}<th scope="col">All</th></tr></thead><tbody>{rows}</tbody></table></div>'
         if rows
         else '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
     )
@@ -83,7 +83,8 @@ def data_html(run: str, counts: dict[tuple[str, str], list[int]], classes: list[
         '<a class="od-button od-primary" href="/export.csv" download>Download CSV</a></div>'
         f"{classes_html(classes)}<section><h3>By rater and stage</h3>{table}</section>"
         "<section><h3>Where they are</h3><p>Every rating is a row of the view <code>ratings</code> in this "
-        f"SQLite file, which other programs may read while onedemo runs:</p><p><code>{escape(path)}</code></p>"
+        "SQLite file, which other programs may read while onedemo runs:</p>"
+        f"<p><code>{escape(path)}</code></p>"
         "<p class=od-quiet>The CSV has the same columns, for all runs: one header, times in UTC, "
         "formula-like cells made harmless.</p></section></article>"
     )

@@ -15,6 +15,7 @@ from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
 from typing import Protocol
 
 from aiohttp import ClientSession, WSMsgType, web
@@ -34,6 +35,8 @@ _SESSION_DAYS = 30
 _MAX_CLIENT_MESSAGE = 1 << 20
 """Bytes a browser may send in one message; what the page needs is a few hundred."""
 
+# Viser's script is inline and compressed, hence unsafe-inline and WebAssembly. The one thing that
+# asks for unsafe-eval is its sorter of Gaussian splats, which we do not show: it is refused.
 _SECURITY_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
@@ -61,7 +64,7 @@ class Trained(Protocol):
         """What the trainer is doing."""
         ...
 
-    def clip_file(self, clip_id: int):
+    def clip_file(self, clip_id: int) -> Path:
         """The picture of a clip."""
         ...
 

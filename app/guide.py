@@ -66,9 +66,10 @@ def guide_html(examples: dict[str, Example]) -> str:
         for names, text in _KEYS
     )
     return (
-        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is trying to learn a move from one '
-        "video. You see about a third of a second of the video, and beside it the robot’s attempt at the same "
-        "piece. Say how similar the two movements are. Your ratings are all the robot learns from.</p></header>"
+        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is trying to learn a move from '
+        "one video. You see about a third of a second of the video, and beside it the robot’s attempt at "
+        "the same piece. Say how similar the two movements are: your ratings tell the robot what to "
+        "practise.</p></header>"
         f'<section><h2>What the numbers mean</h2><ol class="od-scale">{scale}</ol></section>'
         f"<section><h2>Examples from this demonstration</h2>{_examples_html(examples)}</section>"
         '<section class="od-two"><div><h2>What to look at</h2><ul class="od-points">'
@@ -99,6 +100,7 @@ def _examples_html(examples: dict[str, Example]) -> str:
             f"<figcaption><b>{value}</b><span>{text}{times}</span></figcaption></figure>"
         )
     return (
-        '<p class="od-quiet">Both sides are from the demonstration itself; the numbers are what we would give.</p>'
+        '<p class="od-quiet">Both sides are from the demonstration itself; '
+        "the numbers are what we would give.</p>"
         f'<div class="od-examples">{cards}</div>'
     )

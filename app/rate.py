@@ -151,7 +151,10 @@ class Rate:
         self._keys_for = None
 
 
-_SUBMIT = '<div class="od-submit"><button type="button" class="od-button od-primary" data-submit>Submit</button></div>'
+_SUBMIT = (
+    '<div class="od-submit">'
+    '<button type="button" class="od-button od-primary" data-submit>Submit</button></div>'
+)
 
 
 def top_html(count: int, target: int) -> str:
@@ -190,7 +193,8 @@ def waiting_html(status: Status, count: int, problem: str) -> str:
     trouble = f'<p class="od-problem" role="alert">{escape(problem)}</p>' if problem else ""
     if status.target_ratings and count >= status.target_ratings:
         body = (
-            '<div class="od-mark od-done" aria-hidden="true"></div><h2>Thank you. That is all we asked for.</h2>'
+            '<div class="od-mark od-done" aria-hidden="true"></div>'
+            "<h2>Thank you. That is all we asked for.</h2>"
             "<p>The robot goes on practising with your ratings. You can close this page.</p>"
         )
     else:

@@ -1,0 +1,91 @@
+"""Fixtures shared by the tests: a browser, and a page with a stand-in trainer behind a real front."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# Before anything imports mujoco: there is no screen.
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+CHROMIUM_FLAGS = [
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A real headless Chromium, launched by Playwright."""
+    path = next((p for p in ("/usr/bin/chromium", shutil.which("chromium")) if p and Path(p).exists()), None)
+    if path is None:
+        reason = "there is no Chromium: install the package chromium"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=CHROMIUM_FLAGS)
+        yield browser
+        browser.close()
+
+
+@dataclass
+class Site:
+    """A running front with a page and a trainer behind it."""
+
+    trainer: Any
+    page: Any
+    front: Any
+    url: str
+    links: dict[str, str] = field(default_factory=dict)
+
+    def events(self) -> list[tuple]:
+        """What raters did: (kind, clip, value, rater), oldest first, read past the store."""
+        import sqlite3
+        from contextlib import closing
+
+        with closing(sqlite3.connect(self.trainer.store.path)) as db:
+            return db.execute(
+                "SELECT e.kind, e.clip_id, e.value, p.name FROM events e JOIN raters p ON p.id = e.rater_id"
+                " ORDER BY e.id"
+            ).fetchall()
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
+    from standin import StandIn
+
+    from app.front import Front
+    from app.links import issue_link, read_secret
+    from app.pictures import Pictures
+    from app.server import Page
+
+    trainer = StandIn(tmp_path)
+    page = Page(trainer, pictures=Pictures(trainer.demo, read=lambda _: trainer.frames))
+    front = Front(trainer, page, port=0)
+    url = front.start()
+    site = Site(trainer, page, front, url)
+    secret = read_secret(tmp_path)
+    for title, name in (("researcher", "ada"), ("annotator", "bo"), ("second annotator", "cy")):
+        rater = trainer.store.ensure_rater(name, title.split()[-1])
+        site.links[title] = issue_link(trainer.store, secret, rater, url)
+    yield site
+    front.close()
+    page.close()
+    trainer.store.close()

@@ -1,0 +1,163 @@
+"""The public door: nothing without a session, and what each role gets. Real sockets, no browser."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+import socket
+
+import aiohttp
+import pytest
+import viser
+
+from app import exports
+from app.front import Front
+from trainer.errors import UserError
+from trainer.store import RATING_COLUMNS
+
+pytestmark = pytest.mark.seam
+
+
+def fetch(url, path, *, link=None, cookies=None, headers=None, follow=True):
+    """Opens ``link`` if given, then fetches a path: (status, headers, body, cookies)."""
+
+    async def go():
+        jar = aiohttp.CookieJar(unsafe=True)
+        async with aiohttp.ClientSession(cookies=cookies, cookie_jar=jar) as session:
+            if link:
+                await (await session.get(link)).read()
+            async with session.get(url + path, headers=headers, allow_redirects=follow) as response:
+                body = await response.read()
+                return response.status, response.headers, body, [c for c in jar]
+
+    return asyncio.run(go())
+
+
+def connect(url, *, link=None, headers=None):
+    """Opens the WebSocket as a browser would and returns the status, 101 if it was let in."""
+
+    async def go():
+        jar = aiohttp.CookieJar(unsafe=True)
+        async with aiohttp.ClientSession(cookie_jar=jar) as session:
+            if link:
+                await (await session.get(link)).read()
+            try:
+                async with session.ws_connect(
+                    url + "/",
+                    protocols=[f"viser-v{viser.__version__}"],
+                    headers={"Origin": url} if headers is None else headers,
+                ) as socket:
+                    assert socket.protocol == f"viser-v{viser.__version__}"
+                    message = await socket.receive(timeout=5)
+                    assert message.type is aiohttp.WSMsgType.BINARY
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+    return asyncio.run(go())
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/", "/clips/1.webp", "/demo/frames/0.jpg", "/export.csv", "/static/page.css", "/static/page.js", "/x"],
+)
+def test_nothing_without_a_session(site, path):
+    status, headers, body, _ = fetch(site.url, path)
+    assert status == 401
+    assert b"Please open your link" in body
+    assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+    assert fetch(site.url, path, cookies={f"onedemo-{site.front.port}": "guess"})[0] == 401
+
+
+def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
+    assert fetch(site.url, "/login")[0] == 200
+    assert fetch(site.url, "/static/login.css")[0] == 200
+    status, _, body, _ = fetch(site.url, "/healthz")
+    assert status == 200
+    assert b'"phase": "pretrain"' in body
+    site.trainer.set_status(phase="failed", error="disk is full")
+    assert b'"ok": false' in fetch(site.url, "/healthz")[2]
+
+
+def test_link_becomes_a_cookie_that_scripts_cannot_read(site):
+    status, headers, _, _ = fetch(site.url, site.links["annotator"].removeprefix(site.url), follow=False)
+    assert (status, headers["Location"]) == (303, "/")
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie and "SameSite=Lax" in cookie
+    assert headers["Referrer-Policy"] == "no-referrer"
+    status, _, body, _ = fetch(site.url, "/", link=site.links["annotator"])
+    assert status == 200
+    assert b"/static/page.css" in body and b"<title>onedemo</title>" in body
+
+
+def test_unknown_and_revoked_links_are_refused_kindly(site):
+    status, _, body, _ = fetch(site.url, "/login?token=wrong")
+    assert status == 403
+    assert b"This link does not work" in body
+    rater = next(r for r in site.trainer.store.raters() if r.name == "bo")
+    site.trainer.store.revoke_tokens(rater.id)
+    assert fetch(site.url, site.links["annotator"].removeprefix(site.url))[0] == 403
+
+
+def test_clips_of_the_run_and_nothing_else(site):
+    link = site.links["annotator"]
+    status, headers, body, _ = fetch(site.url, "/clips/1.webp", link=link)
+    assert (status, headers["Content-Type"], body[:4]) == (200, "image/webp", b"RIFF")
+    assert headers["Cache-Control"] == "private, max-age=31536000, immutable"
+    assert headers["X-Content-Type-Options"] == "nosniff"
+    for path in (
+        "/clips/999.webp",
+        "/clips/../page.css",
+        "/static/..%2fpyproject.toml",
+        "/demo/frames/999.jpg",
+    ):
+        assert fetch(site.url, path, link=link)[0] == 404, path
+    assert fetch(site.url, "/demo/frames/3.jpg", link=link)[2][:2] == b"\xff\xd8"
+    assert fetch(site.url, "/demo/examples/far.webp", link=link)[2][:4] == b"RIFF"
+
+
+def test_export_is_for_researchers(site):
+    store = site.trainer.store
+    nasty = store.ensure_rater('=HYPERLINK("http://x")', "annotator")
+    store.rate(2, nasty.id, 5, 1200)
+    assert fetch(site.url, "/export.csv", link=site.links["annotator"])[0] == 403
+    status, headers, body, _ = fetch(site.url, "/export.csv", link=site.links["researcher"])
+    assert status == 200
+    assert headers["Content-Disposition"].startswith('attachment; filename="onedemo-ratings-')
+    rows = list(csv.reader(io.StringIO(body.decode())))
+    assert tuple(rows[0]) == RATING_COLUMNS
+    row = dict(zip(rows[0], rows[1], strict=True))
+    assert (row["clip_id"], row["value"], row["latency_ms"]) == ("2", "5", "1200")
+    assert row["rater"] == '\'=HYPERLINK("http://x")'
+    assert row["created_at"].endswith("Z")
+
+
+def test_csv_cells_that_look_like_formulas_are_defused():
+    for text in ("=1", "+1", "-1", "@x", "\tx", "\rx"):
+        assert exports.defuse(text) == "'" + text
+    assert exports.defuse(-1.5) == -1.5
+    assert exports.defuse("a=b") == "a=b"
+    blocks = list(exports.csv_blocks([(1,) * 14] * 5, rows_per_block=2))
+    assert b"".join(blocks).count(b"\r\n") == 6
+
+
+def test_websocket_needs_session_and_own_origin(site):
+    link = site.links["annotator"]
+    assert connect(site.url) == 401
+    assert connect(site.url, link=link) == 101
+    assert connect(site.url, link=link, headers={"Origin": "http://elsewhere.example"}) == 403
+    assert connect(site.url, link=link, headers={}) == 403
+
+
+def test_port_in_use_is_one_clear_sentence(site):
+    with pytest.raises(UserError, match=rf"port {site.front.port} .* is in use; choose another with --port"):
+        Front(site.trainer, site.page, port=site.front.port).start()
+
+
+def test_viser_is_on_the_loopback_only(site):
+    with pytest.raises(OSError):
+        host = socket.gethostbyname(socket.gethostname())
+        if host.startswith("127."):
+            raise OSError("this machine has no other address")
+        socket.create_connection((host, site.page.port), timeout=1)

@@ -1,0 +1,229 @@
+"""The page in a real headless Chromium: rate by key, button and slider; watch; download."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.seam
+
+DESKTOP = {"width": 1440, "height": 900}
+PHONE = {"width": 390, "height": 844}
+GUARD_MS = 400
+"""A little more than the time in which a press cannot be meant for the clip."""
+
+
+@contextmanager
+def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[Any]:
+    """A page of a new browser profile, opened by a link, its header drawn."""
+    context = chromium.new_context(viewport=viewport, **options)
+    page = context.new_page()
+    page.goto(link)
+    page.wait_for_selector(".od-header", timeout=30_000)
+    try:
+        yield page
+    finally:
+        context.close()
+
+
+def shown_clip(page) -> int:
+    """The clip on screen, its picture loaded, old enough to be rated."""
+    page.wait_for_selector(".od-clip")
+    page.wait_for_function(
+        "() => { const p = [...document.querySelectorAll('.od-side img')];"
+        " return p.length === 2 && p.every(i => i.complete && i.naturalWidth > 0) }"
+    )
+    page.wait_for_timeout(GUARD_MS)
+    clip = int(page.locator(".od-clip").get_attribute("data-clip"))
+    assert (
+        page.locator(".od-left img").evaluate("i => new URL(i.currentSrc).pathname") == f"/clips/{clip}.webp"
+    )
+    return clip
+
+
+def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+    """Waits until something is true, and returns it."""
+    end = time.monotonic() + seconds
+    while not (value := condition()):
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.02)
+    return value
+
+
+def press_and_wait(page, site, act: Callable[[], Any]) -> tuple:
+    """Does something that rates, waits until another clip or none is on screen, returns the new event."""
+    before = len(site.events())
+    clip = page.locator(".od-clip").get_attribute("data-clip")
+    act()
+    event = until(lambda: site.events()[before:])[0]
+    page.wait_for_function(
+        "clip => document.querySelector('.od-clip')?.dataset.clip !== clip", arg=clip, timeout=10_000
+    )
+    return event
+
+
+def drag_slider(page, value: int) -> None:
+    box = page.locator(".mantine-Slider-track").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] * (value - 1) / 4, box["y"] + box["height"] / 2, steps=5)
+    page.mouse.up()
+
+
+def test_annotator_rates_by_key_button_and_slider_and_researcher_downloads_it(chromium, site, tmp_path):
+    expected = []
+    with opened(chromium, site.links["annotator"]) as page:
+        assert page.locator(".od-tabs button").all_inner_texts() == ["Rate", "Guide"]
+        ways: list[tuple[int, Callable[[], Any]]] = [
+            (4, lambda: page.keyboard.press("4")),
+            (2, lambda: page.click('.od-answers [data-key="2"]')),
+            (5, lambda: (drag_slider(page, 5), page.click("[data-submit]"))),
+            (1, lambda: page.keyboard.press("1")),
+            (3, lambda: page.click("[data-submit]")),  # The slider is back in the middle.
+        ]
+        for value, act in ways:
+            clip = shown_clip(page)
+            expected.append((clip, value))
+            assert press_and_wait(page, site, act) == ("rate", clip, value, "bo")
+        assert len(set(expected)) == 5
+        page.wait_for_selector(".od-progress >> text=5 of 200")
+        assert page.request.get(f"{site.url}/export.csv").status == 403
+    with opened(chromium, site.links["researcher"], accept_downloads=True) as page:
+        page.click('.od-tabs >> text="Data"')
+        with page.expect_download() as download:
+            page.click("text=Download CSV")
+        path = tmp_path / "ratings.csv"
+        download.value.save_as(path)
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert [(int(row["clip_id"]), int(row["value"])) for row in rows] == expected
+        assert {row["rater"] for row in rows} == {"bo"}
+        assert all(300 <= int(row["latency_ms"]) < 60_000 for row in rows)
+
+
+def test_held_key_gives_one_rating(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        for _ in range(40):  # Playwright repeats the key as a keyboard does.
+            page.keyboard.down("5")
+            page.wait_for_timeout(30)
+        page.keyboard.up("5")
+        page.wait_for_timeout(300)
+        assert site.events() == [("rate", clip, 5, "bo")]
+
+
+def test_undo_and_skip(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        first = shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("1"))
+        second = shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("s"))
+        shown_clip(page)
+        assert press_and_wait(page, site, lambda: page.keyboard.press("u")) == ("undo", second, None, "bo")
+        page.wait_for_selector(f'.od-clip[data-clip="{second}"]')
+        assert press_and_wait(page, site, lambda: page.keyboard.press("Backspace")) == (
+            "undo",
+            first,
+            None,
+            "bo",
+        )
+        assert shown_clip(page) == first
+        press_and_wait(page, site, lambda: page.keyboard.press("2"))
+        assert [row[1:6:4] for row in site.trainer.store.iter_ratings()] == [(first, 2)]
+
+
+def test_keys_do_nothing_on_another_tab(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        shown_clip(page)
+        page.click('.od-tabs >> text="Guide"')
+        page.wait_for_selector(".od-example img")
+        for key in ("1", "s", "u"):
+            page.keyboard.press(key)
+        page.wait_for_timeout(300)
+        assert site.events() == []
+        page.click('.od-tabs >> text="Rate"')
+        clip = shown_clip(page)
+        assert press_and_wait(page, site, lambda: page.keyboard.press("3")) == ("rate", clip, 3, "bo")
+
+
+def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site, monkeypatch):
+    import sqlite3
+
+    store = site.trainer.store
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                store, "rate", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full"))
+            )
+            page.keyboard.press("3")
+            page.wait_for_selector(".od-problem >> text=disk is full")
+            assert page.locator(".od-clip").get_attribute("data-clip") == str(clip)
+        site.trainer.set_status(phase="failed", error="The graphics memory is full.")
+        page.wait_for_selector(".od-banner >> text=The graphics memory is full.")
+        page.wait_for_timeout(GUARD_MS)
+        press_and_wait(page, site, lambda: page.keyboard.press("3"))
+        page.wait_for_selector(".od-problem", state="detached")
+        site.trainer.set_status(phase="online", message="The robot is practising.", next_clips_s=20.0)
+        store.set_clip_state([c.id for c in store.waiting_clips(site.trainer.run)], "withdrawn")
+        shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("3"))
+        page.wait_for_selector("text=The robot is practising. New attempts in about 20 s.")
+        (new,) = site.trainer.add_clips(1)
+        assert shown_clip(page) == new
+        site.trainer.set_status(target_ratings=3)
+        press_and_wait(page, site, lambda: page.keyboard.press("5"))
+        page.wait_for_selector("text=Thank you")
+
+
+def test_researcher_sees_the_robot_move(chromium, site):
+    with opened(chromium, site.links["researcher"]) as page:
+        canvas = page.locator("canvas[data-engine]")
+        page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
+        page.wait_for_timeout(2000)
+        pictures = {canvas.screenshot()}
+        for _ in range(3):
+            page.wait_for_timeout(400)
+            pictures.add(canvas.screenshot())
+        assert len(pictures) > 1
+        times = set()
+        for _ in range(4):
+            times.add(page.locator(".od-demonstration img").get_attribute("src"))
+            page.wait_for_timeout(250)
+        assert len(times) > 1
+        site.trainer.store.add_iteration(
+            site.trainer.run, 1, snapshot=1, env_steps=16000, stats={"predicted": 1.5, "kl": 0.01}
+        )
+        assert page.locator(".uplot").count() == 3
+        page.click("text=Pause")
+        until(lambda: site.trainer.calls == ["pause"])
+        page.click("text=Resume")
+        until(lambda: site.trainer.calls == ["pause", "resume"])
+        page.click("text=Stop")
+        page.click("text=Press again to stop")
+        until(lambda: site.trainer.calls == ["pause", "resume", "stop"])
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_everything_needed_to_rate_is_on_one_screen(chromium, site, viewport):
+    with opened(chromium, site.links["annotator"], viewport) as page:
+        shown_clip(page)
+        for selector in (".od-rate-top", ".od-clip", ".od-answers", ".mantine-Slider-thumb", ".od-tools"):
+            box = page.locator(selector).bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= viewport["width"], selector
+            assert box["y"] >= 0 and box["y"] + box["height"] <= viewport["height"], selector
+
+
+def test_closed_page_frees_its_clip(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        with opened(chromium, site.links["second annotator"]) as other:
+            assert shown_clip(other) not in (clip, clip + 1)
+    until(lambda: not site.page._sessions)
+    with opened(chromium, site.links["second annotator"]) as other:
+        assert shown_clip(other) == clip
