@@ -2,7 +2,7 @@
 
 ``python -m trainer.baselines.trajopt --flips 4 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
-1999) searches the next 0.6 s of motor commands for those that best keep a timetable of leaps, and
+1999) searches the next 0.8 s of motor commands for those that best keep a timetable of leaps, and
 the first part of the best plan is carried out. What reinforcement learning finds for the same
 move is tumbling over the ground; these flips are what a person would call a backflip.
 
@@ -23,11 +23,17 @@ from tqdm import tqdm
 from trainer import envs
 from trainer.errors import UserError
 from trainer.hidden import SUFFIX, HiddenStates, save_hidden
-from trainer.motion import backflip_reward, clean_turns, clearances, net_turns
+from trainer.motion import backflip_reward, clean_turns, clearances, joint_points, net_turns
 
 GRAVITY = 9.81
-STANDING = 1.22
+STANDING = 1.2
 """Torso height of a relaxed stance, metres."""
+TAKE_OFF = 0.7
+"""Height of the centre of mass when the foot leaves the ground, metres."""
+LEAD = 0.1
+"""Seconds by which the turn begins before the flight and ends after it."""
+MASSES = {"torso": 3.53, "thigh": 3.93, "leg": 2.71, "foot": 5.09}
+"""Of the hopper's parts, kg (hopper.xml, capsules of density 1000 kg/m3)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,9 +44,9 @@ class FlipPlan:
     """How many flips are on the timetable."""
     period: float = 1.9
     """Seconds from one flip to the next."""
-    start: float = 0.6
+    start: float = 0.4
     """Seconds into its period at which a flip leaves the ground."""
-    roll: float = 0.6
+    roll: float = 0.7
     """Seconds a flip takes."""
     seconds: float = 8.0
     """Length of the whole."""
@@ -52,7 +58,7 @@ class FlipPlan:
     """Of the search, per knot."""
     knots: int = 12
     """K: a plan is this many constant commands."""
-    hold: int = 6
+    hold: int = 8
     """Control steps that one command lasts."""
     seed: int = 0
     """Of the search."""
@@ -105,43 +111,62 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
 
 
 def timetable(plan: FlipPlan, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the torso should do at times t.
+    """What the robot should do at times t.
 
     Args:
         plan: The timetable.
         t: Seconds since the start, any shape.
 
     Returns:
-        Torso angle in radians, height in metres, and whether a flip is under way; shapes of t.
+        Torso angle in radians, height of the centre of mass in flight in metres, and the seconds
+        since this period's take-off (NaN after the last flip); shapes of t.
     """
     turn = np.floor(t / plan.period)
-    since = t - turn * plan.period - plan.start  # seconds since this period's take-off
-    phase = np.clip(since / plan.roll, 0, 1)
+    since = t - turn * plan.period - plan.start
+    phase = np.clip((since + LEAD) / (plan.roll + 2 * LEAD), 0, 1)
     done = np.minimum(turn + phase, plan.flips)
-    flying = (since > 0) & (since < plan.roll) & (turn < plan.flips)
-    rise = GRAVITY / 2 * since * (plan.roll - since)  # a ballistic arc of that duration
+    arc = TAKE_OFF + GRAVITY / 2 * since * (plan.roll - since)  # ballistic, of that duration
     # A full turn and a little: whole turns are counted rounded down.
-    lean = 0.05 * np.minimum(done, 1)
-    return -2 * np.pi * done - lean, np.where(flying, STANDING + rise, STANDING), flying
+    angle = -2 * np.pi * done - 0.05 * np.minimum(done, 1)
+    return angle, arc, np.where(turn < plan.flips, since, np.nan)
 
 
 def cost(plan: FlipPlan, qpos_NTq: np.ndarray, qvel_NTv: np.ndarray, t_T: np.ndarray) -> np.ndarray:
     """How far candidate trajectories are from the timetable, mean over time, (N,)."""
-    angle, height, flying = timetable(plan, t_T)
+    angle, arc, since = timetable(plan, t_T)
+    flying = (since > 0) & (since < plan.roll)
+    crouching = (since > -0.3) & (since <= 0)
+    landing = (since >= plan.roll) & (since < plan.roll + 0.3)
+    standing = ~(flying | crouching | landing)
     x, z, torso, thigh, leg = (qpos_NTq[..., i] for i in range(5))
     gaps = clearances(qpos_NTq)
     lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
     cost_NT = (
-        4 * np.minimum((torso - angle) ** 2, 4)
-        + 3 * (z - height) ** 2
+        4 * np.minimum((torso - angle) ** 2, 6)
+        + 15 * flying * (centre_of_mass(qpos_NTq)[..., 1] - arc) ** 2
+        + 3 * ~(flying | crouching) * (z - STANDING) ** 2
         + 0.05 * qvel_NTv[..., 0] ** 2
         + 0.02 * x**2
-        + 20 * np.maximum(0, 0.2 - lowest)  # nothing but the foot near the ground
-        + ~flying * (0.03 * qvel_NTv[..., 2] ** 2 + 0.3 * (thigh + 0.3) ** 2 + 0.2 * (leg + 0.5) ** 2)
+        + 20 * np.maximum(0, 0.15 - lowest)  # nothing but the foot near the ground
+        + standing * 0.03 * qvel_NTv[..., 2] ** 2
+        + standing * (0.3 * (thigh + 0.3) ** 2 + 0.2 * (leg + 0.5) ** 2)
     )
     weight_T = np.ones(len(t_T))
     weight_T[-6:] = 3  # where the plan leads matters more than how it gets there
     return (cost_NT * weight_T).mean(1)
+
+
+def centre_of_mass(qpos: np.ndarray) -> np.ndarray:
+    """The hopper's centre of mass, (..., q) to (x, z) in metres, (..., 2)."""
+    point = joint_points(qpos)
+    middles = (
+        ("torso", "top", "hip"),
+        ("thigh", "hip", "knee"),
+        ("leg", "knee", "ankle"),
+        ("foot", "heel", "toe"),
+    )
+    moments = [MASSES[part] * (point[a] + point[b]) / 2 for part, a, b in middles]
+    return np.sum(moments, axis=0) / sum(MASSES.values())
 
 
 def _search(
