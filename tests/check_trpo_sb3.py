@@ -1,6 +1,6 @@
 """Our TRPO against sb3-contrib's, on Hopper-v5 with termination, at equal steps and settings.
 
-Run by hand in an environment that also has the extra "check" (sb3-contrib):
+Run by hand in an environment that also has the extra "check" (sb3-contrib) and imageio:
 ``python tests/check_trpo_sb3.py --steps 200000 --seeds 3``. Both get 16 lanes x 128 steps a
 batch, 2 x 64 tanh networks, normalised observations and the same trust region; both are judged
 by the stock return of the mean action over 16 episodes.
@@ -91,9 +91,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=200_000)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", choices=("ours", "sb3-contrib"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     for name, train in (("ours", ours), ("sb3-contrib", theirs)):
+        if args.only not in (None, name):
+            continue
         returns, speeds = [], []
         for seed in range(args.seeds):
             reward, seconds = train(args.steps, seed)

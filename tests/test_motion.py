@@ -57,7 +57,12 @@ def test_geometry_is_the_models():
     env = envs.make("hopper", 1, nthread=0)
     model, data = env.model, mujoco.MjData(env.model)
     contacts = 0
-    for qpos in random_qpos(300, 0):
+    poses = random_qpos(300, 0)
+    # The last ones rest within the contact margin: a part lies on the ground before it reaches it.
+    gaps = motion.clearances(poses[250:])
+    lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
+    poses[250:, 1] += np.linspace(0.0001, 0.004, 50) - lowest
+    for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
         points, gaps = motion.joint_points(qpos), motion.clearances(qpos)
@@ -75,7 +80,7 @@ def test_geometry_is_the_models():
         touching = any({floor, i} in pairs for i in ids)
         assert motion.fallen(qpos) == touching
         contacts += touching
-    assert 50 < contacts < 250
+    assert 50 < contacts < 270
 
 
 def test_backflip_reward_by_hand():

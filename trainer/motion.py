@@ -15,8 +15,10 @@ import numpy as np
 
 from trainer import envs
 
-CONTACT_MARGIN = 0.001
-"""Metres between a part and the ground at which MuJoCo's contact sets in (hopper.xml, margin)."""
+CONTACT_MARGIN = 0.002
+"""Metres between a part and the ground at which MuJoCo's contact sets in: a part can lie on the
+ground at rest without reaching it. Both geoms have a margin of 0.001 (hopper.xml); MuJoCo 4 adds
+them up."""
 
 # hopper.xml: length of each part along its own axis from joint to joint, metres.
 _HALF_TORSO, _THIGH, _LEG = 0.2, 0.45, 0.5
