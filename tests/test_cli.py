@@ -1,13 +1,12 @@
 import csv
 import json
-import os
 import socket
 import sqlite3
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from serving import Serving
 
 from app.cli import main
 from trainer.migrations import STEPS as SCHEMA
@@ -101,41 +100,24 @@ def test_the_headless_run_of_the_readme(tmp_path, capsys):
 
 
 @pytest.fixture
-def serve(tmp_path):
-    """Starts ``onedemo serve`` as a child process; its links once it is ready."""
-    children = []
-
-    def start(*options):
-        log = (tmp_path / "log").open("w+")
-        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(tmp_path / "data"), *options]
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=os.environ)
-        children.append((child, log))
-        assert child.stdout is not None
-        links = dict(
-            line.strip().split(": ", 1) for line in (child.stdout.readline(), child.stdout.readline()) if line
-        )
-        return child, links, Path(log.name)
-
-    yield start
-    for child, log in children:
-        child.kill()
-        child.wait()
-        child.stdout.close()
-        log.close()
+def serving(tmp_path):
+    serving = Serving(tmp_path / "data")
+    yield serving
+    serving.close()
 
 
 @pytest.mark.seam
-def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(serve, tmp_path):
+def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(serving):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    child, links, _ = serve("--port", str(port))
+    child, links, _ = serving.start("--port", str(port))
     assert list(links) == ["researcher", "annotator"]
     assert all(link.startswith(f"http://127.0.0.1:{port}/login?token=") for link in links.values())
-    second, none, log = serve("--port", str(port))
+    second, none, log = serving.start("--port", str(port))
     assert second.wait(30) == 2 and not none
     assert "another onedemo is working on" in log.read_text()
-    other, none, log = serve("--port", str(port), "--new-run")
+    other, none, log = serving.start("--port", str(port), "--new-run")
     assert other.wait(30) == 2 and not none
     assert f"port {port}" in log.read_text() and "--port" in log.read_text()
     child.terminate()

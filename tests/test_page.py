@@ -33,7 +33,7 @@ def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[An
 
 def shown_clip(page) -> int:
     """The clip on screen, its picture loaded, old enough to be rated."""
-    page.wait_for_selector(".od-clip")
+    page.wait_for_selector(".od-clip", timeout=90_000)
     page.wait_for_function(
         "() => { const p = [...document.querySelectorAll('.od-side img')];"
         " return p.length === 2 && p.every(i => i.complete && i.naturalWidth > 0) }"
