@@ -1,4 +1,4 @@
-"""Clean standing backflips with landings, by trajectory optimisation.
+"""Standing backflips with landings, by trajectory optimisation. It makes one of the demos.
 
 ``python -m trainer.baselines.trajopt --flips 4 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
