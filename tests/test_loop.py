@@ -156,6 +156,11 @@ def test_people_rate_and_the_trainer_follows(store, demo):
     wait_for(lambda: trainer_.status().iteration > iterations)
     trainer_.stop()
     assert trainer_.status().phase == "stopped"
+    iterations = trainer_.status().iteration
+    trainer_.resume()  # from its checkpoint
+    wait_for(lambda: trainer_.status().iteration > iterations)
+    trainer_.stop()
+    assert [row["number"] for row in store.iterations("r")] == list(range(1, trainer_.status().iteration + 1))
 
 
 def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypatch):

@@ -104,7 +104,8 @@ class Trainer:
     # What other threads may call
 
     def start(self) -> None:
-        """Starts the thread."""
+        """Starts the thread; a run that was stopped goes on from its checkpoint."""
+        self._stop.clear()
         self._thread = threading.Thread(target=self.work, name="trainer", daemon=True)
         self._thread.start()
 
@@ -113,9 +114,12 @@ class Trainer:
         self._pause.set()
 
     def resume(self) -> None:
-        """Goes on after ``pause``, and tries again after a failure."""
+        """Goes on after ``pause`` or ``stop``, and tries again after a failure."""
         self._pause.clear()
         self._retry.set()
+        if self._stop.is_set() and self._thread is not None:
+            self._thread.join()
+            self.start()
 
     def stop(self, timeout_s: float = 60.0) -> None:
         """Ends the run's thread after the iteration in hand; the checkpoint stays."""
