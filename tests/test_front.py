@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import io
 import socket
@@ -10,6 +9,7 @@ import socket
 import aiohttp
 import pytest
 import viser
+from aside import run
 
 from app import exports
 from app.front import Front
@@ -31,7 +31,7 @@ def fetch(url, path, *, link=None, cookies=None, headers=None, follow=True):
                 body = await response.read()
                 return response.status, response.headers, body, [c for c in jar]
 
-    return asyncio.run(go())
+    return run(go())
 
 
 def connect(url, *, link=None, headers=None):
@@ -55,7 +55,7 @@ def connect(url, *, link=None, headers=None):
             except aiohttp.WSServerHandshakeError as error:
                 return error.status
 
-    return asyncio.run(go())
+    return run(go())
 
 
 @pytest.mark.parametrize(

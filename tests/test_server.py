@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import aiohttp
 import pytest
 import viser
+from aside import run
 from viser import _messages
 
 from app import assets, server
@@ -43,7 +42,7 @@ def test_direct_connection_gets_no_page(site):
                     assert message.type is aiohttp.WSMsgType.BINARY
                     assert b"od-header" not in message.data
 
-    assert asyncio.run(go()) == 1008
+    assert run(go()) == 1008
     assert not site.page._sessions
 
 
