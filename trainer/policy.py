@@ -34,7 +34,7 @@ class PolicyConfig:
     what a table holds for the demo step (say, frame features); "pose": no time; "raw": the
     observation alone."""
     hidden: tuple[int, ...] = (64, 64)
-    """Widths of the tanh layers, of the policy and of the value function (FACTS: 2 x 64, the
+    """Widths of the tanh layers, of the policy and of the value function (2 x 64: the
     network of the human-preferences literature)."""
     log_std: float = 0.0
     """Initial log standard deviation of each action; actions reach from -1 to 1."""

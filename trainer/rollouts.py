@@ -2,7 +2,7 @@
 
 ``Collector`` keeps its lanes running between iterations, so a batch may be shorter than an
 episode. ``EpisodeRules`` says how episodes start, how the demo clock moves and when an episode
-ends early; the class itself is the plain case, and the trainer's loop subclasses it.
+ends early; the class itself is the plain case; subclass it for another.
 
 Shapes: N lanes, T control steps, o observations, a actions, q = v positions and velocities,
 f policy inputs, K lanes that restart.
