@@ -46,8 +46,10 @@ class Rate:
         gui = session.client.gui
         self._top = gui.add_html("")
         self._stage = gui.add_html("")
-        self._slider_folder = gui.add_folder(None, visible=False)
-        with self._slider_folder:
+        self._answering = gui.add_folder(None, visible=False)
+        with self._answering:
+            # Never redrawn: who presses a button with the keyboard keeps the focus on it.
+            gui.add_html(answers_html())
             marks = tuple((value, str(value)) for value in range(1, 6))
             self._slider = gui.add_slider("Rating", 1, 5, 1, _MIDDLE, marks=marks)
             gui.add_html(_SUBMIT)
@@ -107,14 +109,14 @@ class Rate:
     def _draw(self) -> None:
         clip = self._desk.current
         count = sum(self._store.ratings_by_class(self._run))
-        self._put(self._top, top_html(count, self._status.target_ratings))
+        self._put(self._top, top_html(count, self._status.target_ratings, asking=clip is not None))
         if clip is not None:
             self._put(self._stage, clip_html(clip, self._desk.upcoming, self._problem))
         else:
             self._put(self._stage, waiting_html(self._status, count, self._problem))
         self._put(self._tools, tools_html(clip is not None, self._desk.can_undo))
-        if self._slider_folder.visible != (clip is not None):
-            self._slider_folder.visible = clip is not None
+        if self._answering.visible != (clip is not None):
+            self._answering.visible = clip is not None
         self._set_keys(clip)
 
     def _put(self, handle: Any, content: str) -> None:
@@ -157,35 +159,39 @@ _SUBMIT = (
 )
 
 
-def top_html(count: int, target: int) -> str:
-    """The question, and how far the ratings have come."""
+def top_html(count: int, target: int, *, asking: bool) -> str:
+    """The question, if there is something to rate, and how far the ratings have come."""
     share = min(1.0, count / target) if target else 0.0
+    question = "How similar is the attempt to the demonstration?" if asking else ""
+    progress = f"<b>{count}</b> of {target}" if count < target else f"<b>{count}</b>, as many as asked for"
     return (
-        '<div class="od-rate-top"><h1>How similar is the attempt to the demonstration?</h1>'
-        f'<div class="od-progress"><span><b>{count}</b> of {target}</span>'
+        f'<div class="od-rate-top"><h1>{question}</h1>'
+        f'<div class="od-progress"><span>{progress}</span>'
         f'<i role="progressbar" aria-label="Ratings so far" aria-valuemin="0" aria-valuemax="{target}" '
         f'aria-valuenow="{count}"><i style="width:{100 * share:.1f}%"></i></i></div></div>'
     )
 
 
 def clip_html(clip: int, upcoming: int | None, problem: str) -> str:
-    """The clip, its five answers, and the next clip fetched ahead."""
+    """The clip, and the next one fetched ahead."""
     source = f"/clips/{clip}.webp"
     sides = "".join(
         f'<figure class="od-side od-{side}"><figcaption>{caption}</figcaption>'
         f'<div><img src="{source}" alt="{caption}" decoding="sync" draggable="false"></div></figure>'
         for side, caption in (("left", "Demonstration"), ("right", "Attempt"))
     )
+    ahead = f'<img class="od-ahead" src="/clips/{upcoming}.webp" alt="">' if upcoming is not None else ""
+    trouble = f'<p class="od-problem" role="alert">{escape(problem)}</p>' if problem else ""
+    return f'<div class="od-clip" data-clip="{clip}">{sides}{ahead}</div>{trouble}'
+
+
+def answers_html() -> str:
+    """The five answers; each presses its key."""
     answers = "".join(
         f'<button type="button" data-key="{value}"><kbd>{value}</kbd><span>{answer}</span></button>'
         for value, answer in enumerate(ANSWERS, start=1)
     )
-    ahead = f'<img class="od-ahead" src="/clips/{upcoming}.webp" alt="">' if upcoming is not None else ""
-    trouble = f'<p class="od-problem" role="alert">{escape(problem)}</p>' if problem else ""
-    return (
-        f'<div class="od-clip" data-clip="{clip}">{sides}{ahead}</div>{trouble}'
-        f'<div class="od-answers" role="group" aria-label="Your rating">{answers}</div>'
-    )
+    return f'<div class="od-answers" role="group" aria-label="Your rating">{answers}</div>'
 
 
 def waiting_html(status: Status, count: int, problem: str) -> str:
