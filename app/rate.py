@@ -89,8 +89,7 @@ class Rate:
                 return
             moved = self._attempt(action)
             if moved or self._problem:
-                with self._client.atomic():
-                    self._draw()
+                self._draw()
                 self._client.flush()
 
     def _attempt(self, action: Any, *, keep_problem: bool = False) -> bool:
@@ -107,8 +106,11 @@ class Rate:
     # Drawing
 
     def _draw(self) -> None:
-        clip = self._desk.current
         count = sum(self._store.ratings_by_class(self._run))
+        with self._client.atomic():  # Clip and keys change together.
+            self._draw_all(self._desk.current, count)
+
+    def _draw_all(self, clip: int | None, count: int) -> None:
         self._put(self._top, top_html(count, self._status.target_ratings, asking=clip is not None))
         if clip is not None:
             self._put(self._stage, clip_html(clip, self._desk.upcoming, self._problem))

@@ -11,6 +11,7 @@ import hmac
 import logging
 import secrets
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -58,6 +59,8 @@ class Page:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         rich.get_console().quiet = True  # Viser prints boxes through it, and addresses nobody should open.
+        # A browser may leave while something is on its way to it; Viser warns of that each time.
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
         self._server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         self.port: int = self._server.get_port()
         lock_down(self._server)

@@ -115,12 +115,12 @@ class Session:
         with self._lock:
             if self._closed:
                 return
-            with self.client.atomic():
-                banner = banner_html(status)
-                if banner != self._banner:
-                    self._banner = self._notice.content = banner
-                for tab in self._tabs:
-                    tab.refresh(status)
+            # Not atomic: tabs ask the database here, and messages of a press would wait for that.
+            banner = banner_html(status)
+            if banner != self._banner:
+                self._banner = self._notice.content = banner
+            for tab in self._tabs:
+                tab.refresh(status)
 
     def close(self) -> None:
         """Lets go of everything the session held."""
