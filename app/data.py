@@ -21,7 +21,7 @@ class Data:
     def __init__(self, session: Session) -> None:
         self._trainer = session.page.trainer
         self._shown = False
-        self._text = ""
+        self._counted = -1
         self._html = session.client.gui.add_html("")
 
     def show(self) -> None:
@@ -38,10 +38,12 @@ class Data:
         if not self._shown:
             return
         store, run = self._trainer.store, self._trainer.run
+        event = store.last_event()
+        if event == self._counted:
+            return
+        self._counted = event
         counts = count_ratings((row[4], row[6], row[5]) for row in store.iter_ratings(run))
-        text = data_html(run, counts, store.ratings_by_class(run), str(store.path.absolute()))
-        if text != self._text:
-            self._text = self._html.content = text
+        self._html.content = data_html(run, counts, store.ratings_by_class(run), str(store.path.absolute()))
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""

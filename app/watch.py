@@ -111,7 +111,7 @@ class Watch:
         self._commands.append(command)
 
     def _toggle(self) -> None:
-        if self._trainer.status().phase in ("paused", "failed"):
+        if self._trainer.status().phase in ("paused", "failed", "stopped"):
             self._trainer.resume()
         else:
             self._trainer.pause()
@@ -176,7 +176,6 @@ _ROBOT = '<figure class="od-view od-robot"><figcaption>Robot, live</figcaption><
 def strip_html(status: Status, confirming: bool) -> str:
     """What the trainer does, in figures, and its controls."""
     running = status.phase in ("starting", "pretrain", "online")
-    ended = status.phase in ("done", "stopped")
     figures = [
         ("Iteration", f"{status.iteration:,}", ""),
         ("Steps", f"{_short(status.env_steps)}", f"of {_short(status.total_steps)}"),
@@ -186,14 +185,16 @@ def strip_html(status: Status, confirming: bool) -> str:
     ]
     cells = "".join(f"<div><dt>{n}</dt><dd>{v} <small>{u}</small></dd></div>" for n, v, u in figures)
     toggle = "Pause" if running else "Try again" if status.phase == "failed" else "Resume"
-    off = " disabled" if ended else ""
+    no_toggle = " disabled" if status.phase == "done" else ""
+    no_stop = " disabled" if status.phase in ("done", "stopped") else ""
     stop = "Press again to stop" if confirming else "Stop"
     return (
         f'<div class="od-strip"><div class="od-state" data-phase="{escape(status.phase)}">'
         f"<b>{_PHASES.get(status.phase, escape(status.phase))}</b><span>{escape(status.message)}</span></div>"
         f'<dl class="od-figures">{cells}</dl><div class="od-controls">'
-        f'<button type="button" class="od-button" data-key="alt+p"{off}>{toggle}</button>'
-        f'<button type="button" class="od-button od-danger" data-key="alt+x"{off}>{stop}</button></div></div>'
+        f'<button type="button" class="od-button" data-key="alt+p"{no_toggle}>{toggle}</button>'
+        f'<button type="button" class="od-button od-danger" data-key="alt+x"{no_stop}>{stop}</button>'
+        "</div></div>"
     )
 
 

@@ -92,7 +92,7 @@ class Trainer:
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
         self._thread: threading.Thread | None = None
-        self._iteration_began = self._iteration_s = 0.0
+        self._work_began = self._work_s = 0.0
         self._status = Status(
             phase="starting",
             message="Looking at the demonstration for the first time.",
@@ -130,9 +130,9 @@ class Trainer:
     def status(self) -> Status:
         """What the thread is doing, as of now."""
         next_clips = None
-        if self._status.phase == "online" and self._iteration_s:
-            gone = time.monotonic() - self._iteration_began
-            next_clips = max(1.0, self._iteration_s - gone)
+        if self._status.phase in ("pretrain", "online") and self._work_s:
+            gone = time.monotonic() - self._work_began
+            next_clips = max(1.0, self._work_s - gone)
         ratings = sum(self.store.ratings_by_class(self.run))
         error = self._status.error or (self._clips.error if self._clips is not None else "")
         return replace(self._status, ratings=ratings, next_clips_s=next_clips, error=error)
@@ -179,7 +179,9 @@ class Trainer:
                 self._stop.wait(_TICK_S)
             elif learner.iteration == 0 and self._ratings() < self.config.ratings.pretrain:
                 self._tell("pretrain", "The robot moves at random until it has learned from your ratings.")
-                self._refit(learner, at_least=_PRETRAIN_REFIT)
+                self._work_began = time.monotonic()
+                if self._refit(learner, at_least=_PRETRAIN_REFIT):
+                    self._work_s = time.monotonic() - self._work_began
                 self._stop.wait(_TICK_S)
             else:
                 self._iterate(learner)
@@ -209,7 +211,7 @@ class Trainer:
         return learner
 
     def _iterate(self, learner: Learner) -> None:
-        began = self._iteration_began = time.monotonic()
+        began = self._work_began = time.monotonic()
         self._refit(learner, at_least=1)
         snapshot = self._snapshot
         assert snapshot is not None, "the policy is trained on a snapshot"
@@ -217,8 +219,8 @@ class Trainer:
         before = learner.env_steps
         rollouts, stats = learner.iterate(snapshot)
         stats |= self._true_reward(rollouts)
-        self._iteration_s = time.monotonic() - began
-        stats["steps_per_s"] = (learner.env_steps - before) / self._iteration_s
+        self._work_s = time.monotonic() - began
+        stats["steps_per_s"] = (learner.env_steps - before) / self._work_s
         self._pool, self._policy = rollouts, learner.policy()
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
         buffer = io.BytesIO()
@@ -228,13 +230,14 @@ class Trainer:
         self._withdraw_stale(learner)
         self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
 
-    def _refit(self, learner: Learner, at_least: int) -> None:
+    def _refit(self, learner: Learner, at_least: int) -> bool:
+        """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
         event = self.store.last_event()
         if event == self._fitted_event or event - self._fitted_event < at_least:
-            return
+            return False
         ratings = self.store.training_set(self.run, as_of=event)
         if not ratings:
-            return
+            return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
         snapshot.save(self._snapshot_file(number))
@@ -243,6 +246,7 @@ class Trainer:
         waiting = self.store.waiting_clips(self.run)
         predicted = {c.id: self._predict(self.store.segment(c.id), c.demo_step) for c in waiting}
         self.store.set_predictions(number, {i: p for i, p in predicted.items() if p is not None})
+        return True
 
     def _ask(self, learner: Learner, *, resting: bool = False) -> None:
         """Cuts as many clips as are missing from the queue, from the newest rollouts.
