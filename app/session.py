@@ -147,11 +147,12 @@ def header_html(titles: list[str], shown: int, demo: str, rater: Rater) -> str:
 
 
 def banner_html(status: Status) -> str:
-    """What everybody must know: that the trainer failed, and that rating goes on."""
-    if status.phase != "failed":
+    """What everybody must know: that something failed, and that rating goes on."""
+    if status.phase != "failed" and not status.error:
         return ""
+    what = "The robot’s practice has stopped." if status.phase == "failed" else "Something went wrong."
     return (
-        '<div class="od-banner" role="alert"><b>The robot’s practice has stopped.</b> '
+        f'<div class="od-banner" role="alert"><b>{what}</b> '
         f"{escape(status.error or 'The reason is in the log.')} "
         "<span>You can go on rating: every rating is kept.</span></div>"
     )
