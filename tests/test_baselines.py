@@ -15,6 +15,7 @@ from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from trainer.motion import (
     backflip_reward,
     clean_turns,
+    clearances,
     fallen,
     net_turns,
     task_reward,
@@ -27,14 +28,14 @@ DEMOS = Path(__file__).parent.parent / "static" / "demos"
 
 
 def tiny(task="backflip", **options):
-    defaults = {"steps": 2000, "lanes": 8, "batch": 50, "horizon": 100, "evaluate_every": 2}
+    defaults = {"steps": 1000, "lanes": 4, "batch": 50, "horizon": 100, "evaluate_every": 2}
     return handcoded.HandcodedConfig(task=task, **(defaults | options))
 
 
 @pytest.mark.parametrize("task", ["backflip", "hop"])
 def test_training_on_a_hand_coded_reward(task, tmp_path):
     result = handcoded.train_handcoded(tiny(task), progress=False)
-    assert [score.steps for score in result.curve] == [800, 1600, 2000]
+    assert [score.steps for score in result.curve] == [400, 800, 1000]
     assert result.best_score.reward_mean == max(score.reward_mean for score in result.curve)
     assert result.episode.qpos.shape == (101, 6)
     handcoded.save_result(tmp_path / "flip.v1", result)
@@ -49,7 +50,7 @@ def test_training_on_a_hand_coded_reward(task, tmp_path):
 
 
 def test_same_seed_same_training():
-    a, b, c = (handcoded.train_handcoded(tiny(seed=s), progress=False) for s in (1, 1, 2))
+    a, b, c = (handcoded.train_handcoded(tiny(seed=s, steps=400), progress=False) for s in (1, 1, 2))
     assert a.best_score.reward_mean == b.best_score.reward_mean
     assert a.best_score.reward_mean != c.best_score.reward_mean
 
@@ -75,7 +76,7 @@ def test_timetable():
     plan = trajopt.FlipPlan(flips=2, period=2.0, start=0.5, roll=0.8)
     t = np.array([0.0, 0.4, 0.9, 1.4, 2.9, 4.5, 8.0])
     angle, arc, since = trajopt.timetable(plan, t)
-    np.testing.assert_allclose(-angle / (2 * np.pi), [0, 0, 0.5, 1, 1.5, 2, 2], atol=0.06)
+    np.testing.assert_allclose(-angle / (2 * np.pi), [0, 0, 0.56, 1, 1.56, 2, 2], atol=0.02)
     np.testing.assert_allclose(since[:5], [-0.5, -0.1, 0.4, 0.9, 0.4])
     assert np.isnan(since[5:]).all(), "no third flip"
     # The apex of a ballistic arc of 0.8 s lies g t^2 / 8 = 0.785 m above the take-off.
@@ -96,15 +97,32 @@ def test_centre_of_mass_is_the_models():
 
 
 def test_short_optimisation_is_a_real_episode():
-    plan = trajopt.FlipPlan(seconds=0.12, samples=8, elites=2, knots=4, iterations=1)
-    hidden = trajopt.optimise_flips(plan, progress=False)
-    assert hidden.qpos.shape == (16, 6)
+    """Also where time was turned back: nothing of what was given up may be left in it."""
+    short = {"flips": 1, "start": 0.1, "roll": 0.1, "period": 0.3, "seconds": 0.84}
+    search = {"samples": 6, "elites": 2, "knots": 3, "iterations": 1, "take_off_iterations": 1}
+    straight, turned = (
+        trajopt.optimise_flips(trajopt.FlipPlan(retries=n, **short, **search), progress=False) for n in (0, 2)
+    )
+    assert straight.qpos.shape == turned.qpos.shape == (106, 6)
+    assert (straight.actions != turned.actions).any(), "no flip in 0.1 s: it was tried again"
     env = envs.make("hopper", 1, nthread=0)
     env.reset()
-    env.set_states(np.array([0]), hidden.qpos[:1], hidden.qvel[:1])
-    for t in range(15):
-        env.step(hidden.actions[t : t + 1])
-        np.testing.assert_allclose(env.qpos[0], hidden.qpos[t + 1], atol=1e-6)
+    env.set_states(np.array([0]), turned.qpos[:1], turned.qvel[:1])
+    for t in range(105):
+        env.step(turned.actions[t : t + 1])
+        np.testing.assert_allclose(env.qpos[0], turned.qpos[t + 1], atol=1e-4)
+
+
+def test_cost_of_the_ground():
+    """One touch costs more than any pose; standing on the foot costs nothing of that kind."""
+    plan = trajopt.FlipPlan()
+    stance = np.array([0, 1.22, 0, 0, 0, 0])
+    kneeling = np.array([0, 0.46, 0.4, -0.6, -1.9, 0])
+    poses = np.stack([stance, kneeling])
+    assert (clearances(poses)["leg"] < trajopt.SAFE).tolist() == [False, True]
+    assert clearances(poses)["foot"][0] < 0.011
+    stance_cost, kneeling_cost = trajopt.cost(plan, poses[:, None], 0 * poses[:, None], np.zeros(1))
+    assert stance_cost < 5 < 30 < kneeling_cost
 
 
 def test_hidden_states_refuse_what_they_are_not(tmp_path):
@@ -145,12 +163,10 @@ def test_shipped_demos(name):
         assert net_turns(hidden.qpos[:, 2]) >= 4
         assert reward > 15_000
     elif name == "hopper-flip-clean":
-        # Four flips from stance to stance. A knee or the head brushes the ground six times, for
-        # less than a tenth of a second each, so by the strict count only one of them is clean.
-        assert net_turns(hidden.qpos[:, 2]) == 4
-        assert clean_turns(hidden.qpos) >= 1
-        assert fallen(hidden.qpos).mean() < 0.06
+        assert net_turns(hidden.qpos[:, 2]) == clean_turns(hidden.qpos) == 3
+        assert not fallen(hidden.qpos).any(), "on the foot alone, all the time"
         assert hidden.qpos[-1, 1] > 1.1
+        assert np.cos(hidden.qpos[-1, 2]) > 0.9, "upright at the end"
     else:
         assert until_fall(hidden.qpos[1:], hidden.qvel[1:]).all()
         assert hidden.qpos[-1, 0] > 8, "a lively hop goes forward"

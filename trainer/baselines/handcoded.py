@@ -15,7 +15,6 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
@@ -25,7 +24,6 @@ from trainer.hidden import SUFFIX, HiddenStates, save_hidden
 from trainer.motion import (
     TASK_REWARDS,
     clean_turns,
-    fallen,
     net_turns,
     task_reward,
     until_fall,
@@ -53,10 +51,6 @@ class HandcodedConfig:
     """Control steps in an episode: 8 s."""
     evaluate_every: int = 10
     """Iterations between evaluations (16 deterministic episodes)."""
-    pick: str = "reward"
-    """What makes a policy best and an episode shown: "reward", the highest mean and the highest
-    total of the hand-coded reward; "clean", the most clean turns, then the least time on the
-    ground with anything but the foot."""
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="raw"))
     """Sees the observation alone: the rewards say nothing about time."""
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
@@ -66,8 +60,6 @@ class HandcodedConfig:
         if self.task not in TASK_REWARDS:
             choices = ", ".join(sorted(TASK_REWARDS))
             raise UserError(f"unknown task {self.task!r}; choose one of: {choices}")
-        if self.pick not in ("reward", "clean"):
-            raise UserError(f"unknown pick {self.pick!r}; choose one of: clean, reward")
         for name in ("steps", "lanes", "batch", "horizon", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -95,16 +87,17 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class HandcodedResult:
-    """What a training gave. "Best" is as ``HandcodedConfig.pick`` says."""
+    """What a training gave."""
 
     config: HandcodedConfig
     curve: tuple[Score, ...]
     """Evaluations, the last one of the final policy."""
     final: Policy
     best: Policy
+    """The one with the highest mean reward in an evaluation."""
     best_score: Score
     episode: HiddenStates
-    """The best episode of the best policy."""
+    """Its episode of the highest reward."""
 
 
 def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> HandcodedResult:
@@ -138,7 +131,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     iterations = -(-config.steps // per_iteration)
     started = time.monotonic()
     curve: list[Score] = []
-    best: tuple[tuple[float, ...], Score, dict, HiddenStates] | None = None
+    best: tuple[Score, dict, HiddenStates] | None = None
     with tqdm(total=iterations * per_iteration, unit="step", disable=not progress) as bar:
         for iteration in range(1, iterations + 1):
             batch = collector.collect(policy.snapshot(), config.batch)
@@ -148,10 +141,10 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
             if iteration % config.evaluate_every == 0 or iteration == iterations:
                 episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)
                 steps, seconds = iteration * per_iteration, time.monotonic() - started
-                score, episode, merit = _judge(config, episodes, steps, seconds)
+                score, episode = _judge(config, episodes, steps, seconds)
                 curve.append(score)
-                if best is None or merit > best[0]:
-                    best = merit, score, policy.to_dict(), episode
+                if best is None or score.reward_mean > best[0].reward_mean:
+                    best = score, policy.to_dict(), episode
                 bar.set_postfix(
                     reward=round(score.reward_mean),
                     best=round(score.reward_max),
@@ -167,9 +160,9 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         config=config,
         curve=tuple(curve),
         final=policy,
-        best=Policy.from_dict(best[2]),
-        best_score=best[1],
-        episode=best[3],
+        best=Policy.from_dict(best[1]),
+        best_score=best[0],
+        episode=best[2],
     )
 
 
@@ -187,37 +180,31 @@ def save_result(prefix: Path, result: HandcodedResult) -> None:
 
 def _judge(
     config: HandcodedConfig, episodes: Episodes, steps: int, seconds: float
-) -> tuple[Score, HiddenStates, tuple[float, ...]]:
-    """The score, the episode to show, and what to compare policies by."""
+) -> tuple[Score, HiddenStates]:
+    """The score, and the episode of the highest reward."""
     states = episodes.obs, episodes.actions, episodes.qpos, episodes.qvel
     rewards_NT = task_reward(config.task, *states)
     upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:])
     if config.task == "hop":  # the stock episode ends at the fall
         rewards_NT = rewards_NT * upright_NT
     totals_N = rewards_NT.sum(1)
-    clean_N, on_ground_N = clean_turns(episodes.qpos), fallen(episodes.qpos).mean(1)
     score = Score(
         steps=steps,
         seconds=round(seconds, 1),
         reward_mean=float(totals_N.mean()),
         reward_max=float(totals_N.max()),
         net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
-        clean_turns_mean=float(clean_N.mean()),
+        clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
         upright_seconds=float(upright_NT.sum(1).mean() * envs.spec("hopper").dt),
     )
-    if config.pick == "clean":
-        lane = int(np.lexsort((on_ground_N, -clean_N))[0])
-        merit = (float(clean_N[lane]), -float(on_ground_N[lane]))
-    else:
-        lane = int(totals_N.argmax())
-        merit = (score.reward_mean,)
+    lane = int(totals_N.argmax())
     episode = HiddenStates(
         obs=episodes.obs[lane],
         actions=episodes.actions[lane],
         qpos=episodes.qpos[lane],
         qvel=episodes.qvel[lane],
     )
-    return score, episode, merit
+    return score, episode
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -229,7 +216,6 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="prefix of the files to write")
     parser.add_argument("--max-kl", type=float, default=TrpoConfig().max_kl, help="nats")
     parser.add_argument("--gamma", type=float, default=TrpoConfig().gamma)
-    parser.add_argument("--pick", choices=("clean", "reward"), default="reward")
     parser.add_argument("--evaluate-every", type=int, default=10, help="iterations")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)  # these networks are too small to gain from more
@@ -237,7 +223,6 @@ def main(argv: list[str] | None = None) -> None:
         task=args.task,
         steps=args.steps,
         seed=args.seed,
-        pick=args.pick,
         evaluate_every=args.evaluate_every,
         trpo=TrpoConfig(max_kl=args.max_kl, gamma=args.gamma),
     )

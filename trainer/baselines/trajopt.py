@@ -1,10 +1,12 @@
 """Standing backflips with landings, by trajectory optimisation. It makes one of the demos.
 
-``python -m trainer.baselines.trajopt --flips 4 --seed 0 --out PREFIX`` writes
+``python -m trainer.baselines.trajopt --flips 3 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
-1999) searches the next 0.8 s of motor commands for those that best keep a timetable of leaps, and
-the first part of the best plan is carried out. What reinforcement learning finds for the same
-move is tumbling over the ground; these flips are what a person would call a backflip.
+1999) searches the next second of motor commands for those that best keep a timetable of leaps, and
+the first part of the best plan is carried out. Touching the ground with anything but the foot
+costs more than anything else; where it happens all the same, time is turned back to before the
+take-off and the search goes another way. What reinforcement learning finds for the same move is
+tumbling over the ground; these flips are what a person would call a backflip.
 
 Shapes: N candidate plans, T control steps ahead, K knots of a plan, a actions, q = v positions
 and velocities.
@@ -23,15 +25,19 @@ from tqdm import tqdm
 from trainer import envs
 from trainer.errors import UserError
 from trainer.hidden import SUFFIX, HiddenStates, save_hidden
-from trainer.motion import backflip_reward, clean_turns, clearances, joint_points, net_turns
+from trainer.motion import backflip_reward, clean_turns, clearances, fallen, joint_points, net_turns
 
 GRAVITY = 9.81
 STANDING = 1.2
 """Torso height of a relaxed stance, metres."""
 TAKE_OFF = 0.7
 """Height of the centre of mass when the foot leaves the ground, metres."""
+CROUCH = 0.35
+"""Seconds before the flight at which the robot begins to crouch."""
 LEAD = 0.1
-"""Seconds by which the turn begins before the flight and ends after it."""
+"""Seconds by which the turn begins before the flight."""
+SAFE = 0.015
+"""Metres that knee, hip and head should keep from the ground; the ankle stands at 0.02."""
 MASSES = {"torso": 3.53, "thigh": 3.93, "leg": 2.71, "foot": 5.09}
 """Of the hopper's parts, kg (hopper.xml, capsules of density 1000 kg/m3)."""
 
@@ -40,11 +46,11 @@ MASSES = {"torso": 3.53, "thigh": 3.93, "leg": 2.71, "foot": 5.09}
 class FlipPlan:
     """The timetable and the search."""
 
-    flips: int = 4
+    flips: int = 3
     """How many flips are on the timetable."""
-    period: float = 1.9
+    period: float = 2.6
     """Seconds from one flip to the next."""
-    start: float = 0.4
+    start: float = 0.5
     """Seconds into its period at which a flip leaves the ground."""
     roll: float = 0.7
     """Seconds a flip takes."""
@@ -56,16 +62,21 @@ class FlipPlan:
     """Best candidates that the next iteration's distribution is fitted to."""
     iterations: int = 3
     """Of the search, per knot."""
-    knots: int = 12
+    take_off_iterations: int = 10
+    """The same at a take-off, which decides the whole flip."""
+    knots: int = 16
     """K: a plan is this many constant commands."""
     hold: int = 8
     """Control steps that one command lasts."""
+    retries: int = 30
+    """How often, in all, a fall turns time back. Later falls pass."""
     seed: int = 0
     """Of the search."""
 
     def __post_init__(self) -> None:
-        if min(self.flips, self.elites, self.iterations, self.knots, self.hold) < 1:
-            raise UserError("flips, elites, iterations, knots and hold must be at least 1")
+        for name in ("flips", "elites", "iterations", "take_off_iterations", "knots", "hold"):
+            if getattr(self, name) < 1:
+                raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.samples < self.elites:
             raise UserError(f"samples ({self.samples}) must be at least elites ({self.elites})")
         if not 0 < self.start + self.roll <= self.period or min(self.roll, self.seconds) <= 0:
@@ -89,17 +100,25 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
     steps = round(plan.seconds / env.dt)
     qpos, qvel = [env.qpos[0]], [env.qvel[0]]
     actions: list[np.ndarray] = []
-    mean_Ka = np.zeros((plan.knots, env.env_spec.action_size))
+    means = [np.zeros((plan.knots, env.env_spec.action_size))]  # before each command, for rewinds
+    retries = 0
     with tqdm(total=steps, unit="step", disable=not progress) as bar:
         while len(actions) < steps:
-            best_Ka, q_Tq, v_Tv = _search(plan, env, qpos[-1], qvel[-1], len(actions), mean_Ka, rng)
+            best_Ka, q_Tq, v_Tv = _search(plan, env, qpos[-1], qvel[-1], len(actions), means[-1], rng)
             take = min(plan.hold, steps - len(actions))
-            actions += [best_Ka[0]] * take
-            qpos += list(q_Tq[:take])
-            qvel += list(v_Tv[:take])
-            mean_Ka = np.concatenate([best_Ka[1:], best_Ka[-1:]])
-            bar.update(take)
-            bar.set_postfix(turns=round(-qpos[-1][2] / (2 * np.pi), 2), z=round(qpos[-1][1], 2))
+            if retries < plan.retries and _failed(plan, q_Tq[:take], len(actions) * env.dt):
+                retries += 1
+                keep = _last_choice(plan, len(means) - 1, env.dt)
+                del means[keep + 1 :], actions[keep * plan.hold :]
+                del qpos[len(actions) + 1 :], qvel[len(actions) + 1 :]
+            else:
+                actions += [best_Ka[0]] * take
+                qpos += list(q_Tq[:take])
+                qvel += list(v_Tv[:take])
+                means.append(np.concatenate([best_Ka[1:], best_Ka[-1:]]))
+            bar.update(len(actions) - bar.n)
+            turns = round(-qpos[-1][2] / (2 * np.pi), 2)
+            bar.set_postfix(turns=turns, z=round(qpos[-1][1], 2), retries=retries)
     env.close()
     states = np.array(qpos), np.array(qvel)
     return HiddenStates(
@@ -123,7 +142,7 @@ def timetable(plan: FlipPlan, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     """
     turn = np.floor(t / plan.period)
     since = t - turn * plan.period - plan.start
-    phase = np.clip((since + LEAD) / (plan.roll + 2 * LEAD), 0, 1)
+    phase = np.clip((since + LEAD) / (plan.roll + LEAD), 0, 1)
     done = np.minimum(turn + phase, plan.flips)
     arc = TAKE_OFF + GRAVITY / 2 * since * (plan.roll - since)  # ballistic, of that duration
     # A full turn and a little: whole turns are counted rounded down.
@@ -135,21 +154,24 @@ def cost(plan: FlipPlan, qpos_NTq: np.ndarray, qvel_NTv: np.ndarray, t_T: np.nda
     """How far candidate trajectories are from the timetable, mean over time, (N,)."""
     angle, arc, since = timetable(plan, t_T)
     flying = (since > 0) & (since < plan.roll)
-    crouching = (since > -0.3) & (since <= 0)
+    crouching = (since > -CROUCH) & (since <= 0)
     landing = (since >= plan.roll) & (since < plan.roll + 0.3)
     standing = ~(flying | crouching | landing)
-    x, z, torso, thigh, leg = (qpos_NTq[..., i] for i in range(5))
-    gaps = clearances(qpos_NTq)
-    lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
+    x, z, torso = (qpos_NTq[..., i] for i in range(3))
+    gaps, point = clearances(qpos_NTq), joint_points(qpos_NTq)
+    above = np.minimum(gaps["torso"], gaps["thigh"])
+    lowest = np.minimum(above, gaps["leg"])
+    centre = centre_of_mass(qpos_NTq)
+    lean = centre[..., 0] - (point["heel"] + point["toe"])[..., 0] / 2
     cost_NT = (
         4 * np.minimum((torso - angle) ** 2, 6)
-        + 15 * flying * (centre_of_mass(qpos_NTq)[..., 1] - arc) ** 2
+        + 6 * flying * (centre[..., 1] - arc) ** 2
         + 3 * ~(flying | crouching) * (z - STANDING) ** 2
         + 0.05 * qvel_NTv[..., 0] ** 2
         + 0.02 * x**2
-        + 20 * np.maximum(0, 0.15 - lowest)  # nothing but the foot near the ground
-        + standing * 0.03 * qvel_NTv[..., 2] ** 2
-        + standing * (0.3 * (thigh + 0.3) ** 2 + 0.2 * (leg + 0.5) ** 2)
+        + 20 * np.maximum(0, 0.15 - above)  # a warning before the touch, where the search feels it
+        + 60 * np.clip((SAFE - lowest) / SAFE, 0, 1)  # nothing but the foot on the ground
+        + standing * (0.01 * np.square(qvel_NTv).sum(-1) + 2 * lean**2)
     )
     weight_T = np.ones(len(t_T))
     weight_T[-6:] = 3  # where the plan leads matters more than how it gets there
@@ -169,6 +191,23 @@ def centre_of_mass(qpos: np.ndarray) -> np.ndarray:
     return np.sum(moments, axis=0) / sum(MASSES.values())
 
 
+def _failed(plan: FlipPlan, qpos_Tq: np.ndarray, t: float) -> bool:
+    """Whether the robot fell, or is not upright though no flip is on."""
+    angle, _, since = timetable(plan, np.array(t))
+    standing = not -CROUCH < since < plan.roll + 0.3
+    return bool(fallen(qpos_Tq).any() or (standing and np.abs(qpos_Tq[:, 2] - angle).max() > 1))
+
+
+def _last_choice(plan: FlipPlan, commands: int, dt: float) -> int:
+    """How many commands to keep after a fall: a plan's length is given up, and the whole flip.
+
+    In the air it is too late for another choice: what went wrong is the take-off.
+    """
+    flip = (commands * plan.hold * dt - plan.start + CROUCH) // plan.period
+    crouch = int((flip * plan.period + plan.start - CROUCH) / (plan.hold * dt))
+    return max(min(commands - plan.knots, crouch), 0)
+
+
 def _search(
     plan: FlipPlan,
     env: envs.HopperVectorEnv,
@@ -182,7 +221,8 @@ def _search(
     t_T = (step + 1 + np.arange(plan.knots * plan.hold)) * env.dt
     std_Ka = np.full_like(mean_Ka, 0.6)
     best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
-    for _ in range(plan.iterations):
+    taking_off = -CROUCH < timetable(plan, t_T[0])[2] < LEAD
+    for _ in range(plan.take_off_iterations if taking_off else plan.iterations):
         noise = rng.standard_normal((plan.samples, *mean_Ka.shape))
         plans_NKa = np.clip(mean_Ka + std_Ka * noise, -1, 1)
         plans_NKa[0] = mean_Ka
