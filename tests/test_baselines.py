@@ -27,6 +27,15 @@ from trainer.rollouts import evaluate
 DEMOS = Path(__file__).parent.parent / "static" / "demos"
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As the command line does: these networks are too small to gain from more."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 def tiny(task="backflip", **options):
     defaults = {"steps": 1000, "lanes": 4, "batch": 50, "horizon": 100, "evaluate_every": 2}
     return handcoded.HandcodedConfig(task=task, **(defaults | options))
