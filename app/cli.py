@@ -169,12 +169,6 @@ def _config(arguments: argparse.Namespace) -> Any:
     return load_config(arguments.config, overrides)
 
 
-def _encoder(arguments: argparse.Namespace, config: Any) -> Any:
-    from trainer.encoders import make_encoder
-
-    return make_encoder(config.encoder, arguments.encoder_weights)
-
-
 def _serve(arguments: argparse.Namespace) -> None:
     from app.serve import serve
     from trainer.demos import find_demo
@@ -184,7 +178,9 @@ def _serve(arguments: argparse.Namespace) -> None:
         data_dir=arguments.data_dir,
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
         config=config,
-        encoder=_encoder(arguments, config),
+        explicit=bool(arguments.settings)
+        or any(given is not None for given in (arguments.config, arguments.seed, arguments.encoder)),
+        encoder_weights=arguments.encoder_weights,
         host=arguments.host,
         port=arguments.port,
         run=arguments.run_name,
@@ -194,6 +190,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     from trainer.demos import find_demo
+    from trainer.encoders import make_encoder
     from trainer.files import write_atomic
     from trainer.headless import train
     from trainer.store import Store
@@ -207,7 +204,7 @@ def _train(arguments: argparse.Namespace) -> None:
             data_dir=arguments.data_dir,
             demo=demo,
             config=config,
-            encoder=_encoder(arguments, config),
+            encoder=make_encoder(config.encoder, arguments.encoder_weights),
             rater=arguments.rater,
             name=arguments.run_name,
             progress=not arguments.quiet,

@@ -11,12 +11,12 @@ from app.front import Front
 from app.links import issue_link, read_secret
 from app.server import Page
 from trainer.config import RunConfig
-from trainer.encoders import Encoder
+from trainer.encoders import make_encoder
 from trainer.files import hold
 from trainer.loop import Trainer
 from trainer.records import Demo
 from trainer.render import RenderThread
-from trainer.runs import open_run
+from trainer.runs import add_run, find_run
 from trainer.store import Store
 
 
@@ -25,7 +25,8 @@ def serve(
     data_dir: Path,
     demo: Demo,
     config: RunConfig,
-    encoder: Encoder,
+    explicit: bool,
+    encoder_weights: Path | None,
     host: str,
     port: int,
     run: str | None,
@@ -38,8 +39,9 @@ def serve(
     Args:
         data_dir: Everything is kept there.
         demo: What is to be learned.
-        config: Settings of the run.
-        encoder: Looks at the demo's frames.
+        config: Settings of a new run.
+        explicit: Whether a run that is gone on with must have these settings, too.
+        encoder_weights: Weights of the encoder, if not its own.
         host: Address to listen on.
         port: Port of the page.
         run: Name of the run to go on with or to make; None: the newest of this demo.
@@ -51,7 +53,14 @@ def serve(
     store = Store(data_dir)
     renderer = RenderThread()
     secret = read_secret(data_dir)
-    run, config = open_run(store, data_dir, demo, config, name=run, resume=not new_run)
+    wanted = config if explicit else None
+    found = None if new_run else find_run(store, data_dir, demo, name=run, wanted=wanted)
+    if found is not None:
+        run, config = found
+    encoder = make_encoder(config.encoder, encoder_weights)
+    if found is None:
+        run = add_run(store, data_dir, demo, config, name=run)
+    assert run is not None
     directory = data_dir / "runs" / run
     with hold(directory / "lock"):
         _log_to(directory / "log")

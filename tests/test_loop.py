@@ -11,7 +11,7 @@ import trainer
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from trainer.loop import Simulated, Trainer
-from trainer.runs import open_run
+from trainer.runs import add_run, find_run
 from trainer.store import Store
 
 
@@ -29,7 +29,9 @@ def store(tmp_path):
 
 def make_trainer(store, demo, simulated=None, config=None, name="r"):
     data_dir = store.path.parent
-    run, config = open_run(store, data_dir, demo, config or small_config(), name=name, resume=True)
+    config = config or small_config()
+    found = find_run(store, data_dir, demo, name=name, wanted=config)
+    run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     return Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=Thumbnail(),
         simulated=simulated,

@@ -28,7 +28,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 def check_name(name: str) -> None:
     """Raises UserError unless the name is safe as a file name and in a link."""
     if not _NAME.fullmatch(name):
-        raise UserError(f"a demo's name is 1 to 64 letters, digits, '-' or '_', got {name[:80]!r}")
+        raise UserError(f"a name is 1 to 64 letters, digits, '-' or '_', got {name[:80]!r}")
 
 
 class SourceWatch:

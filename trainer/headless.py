@@ -17,7 +17,7 @@ from trainer.hidden import hidden_path, load_hidden
 from trainer.loop import Simulated, Trainer
 from trainer.raters import Oracle, make_rater
 from trainer.records import Demo
-from trainer.runs import open_run, program_version
+from trainer.runs import add_run, find_run, program_version
 from trainer.store import Store
 
 
@@ -56,7 +56,8 @@ def train(
     given = sum(store.ratings_by_class(name)) if name else 0
     budget = config.ratings.pretrain + config.ratings.online - given
     simulated = make_rater(rater, hidden, demo=demo.name, budget=budget)
-    run, config = open_run(store, data_dir, demo, config, name=name, resume=name is not None)
+    found = find_run(store, data_dir, demo, name=name, wanted=config) if name else None
+    run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate),

@@ -1,0 +1,67 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from trainer.config import load_config
+from trainer.errors import UserError
+from trainer.records import Demo
+from trainer.runs import add_run, find_run
+from trainer.store import Store
+
+DEMO = Demo(name="flip", sha256="aa", path=Path("flip.webm"), fps=30.0, frames=60, width=8, height=8)
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path)
+    yield store
+    store.close()
+
+
+def test_new_runs_are_numbered(store, tmp_path):
+    assert find_run(store, tmp_path, DEMO, name=None, wanted=None) is None
+    assert add_run(store, tmp_path, DEMO, load_config(), name=None) == "flip-1"
+    assert add_run(store, tmp_path, DEMO, load_config(), name=None) == "flip-2"
+    assert add_run(store, tmp_path, DEMO, load_config(), name="mine") == "mine"
+    assert (tmp_path / "runs" / "flip-2" / "config.toml").exists()
+
+
+def test_the_newest_run_of_the_demo_goes_on_with_its_own_settings(store, tmp_path):
+    settings = load_config(None, {"seed": 4, "trpo.max_kl": 0.02})
+    add_run(store, tmp_path, DEMO, load_config(), name=None)
+    add_run(store, tmp_path, DEMO, settings, name=None)
+    add_run(store, tmp_path, replace(DEMO, name="other"), load_config(), name=None)
+    assert find_run(store, tmp_path, DEMO, name=None, wanted=None) == ("flip-2", settings)
+    assert find_run(store, tmp_path, DEMO, name="flip-1", wanted=load_config()) == ("flip-1", load_config())
+
+
+def test_settings_that_contradict_the_run_are_refused(store, tmp_path):
+    add_run(store, tmp_path, DEMO, load_config(), name=None)
+    with pytest.raises(UserError, match="other settings than those given"):
+        find_run(store, tmp_path, DEMO, name=None, wanted=load_config(None, {"seed": 1}))
+
+
+def test_another_video_under_the_same_name_is_refused(store, tmp_path):
+    add_run(store, tmp_path, DEMO, load_config(), name=None)
+    with pytest.raises(UserError, match="another video"):
+        find_run(store, tmp_path, replace(DEMO, sha256="bb"), name=None, wanted=None)
+
+
+def test_settings_survive_the_loss_of_their_file(store, tmp_path):
+    settings = load_config(None, {"seed": 9})
+    run = add_run(store, tmp_path, DEMO, settings, name=None)
+    (tmp_path / "runs" / run / "config.toml").unlink()
+    assert find_run(store, tmp_path, DEMO, name=run, wanted=None) == (run, settings)
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "", "x" * 65, "a b"])
+def test_names_that_are_no_directory_are_refused(store, tmp_path, name):
+    with pytest.raises(UserError):
+        add_run(store, tmp_path, DEMO, load_config(), name=name)
+
+
+def test_a_taken_name(store, tmp_path):
+    add_run(store, tmp_path, DEMO, load_config(), name="mine")
+    with pytest.raises(UserError, match="'mine' exists already"):
+        add_run(store, tmp_path, DEMO, load_config(), name="mine")
