@@ -8,7 +8,7 @@ BIN := .venv/bin
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: run setup test test-fast test-long check clean
+.PHONY: run setup test test-fast check clean
 
 run: .venv/.installed
 	$(BIN)/onedemo serve --host "$(HOST)" --port "$(PORT)" --data-dir "$(DATA_DIR)" --demo "$(DEMO)"
@@ -16,13 +16,10 @@ run: .venv/.installed
 setup: .venv/.installed
 
 test: .venv/.installed-test
-	$(BIN)/python -m pytest -m "not long"
+	$(BIN)/python -m pytest
 
 test-fast: .venv/.installed-test
-	$(BIN)/python -m pytest -m "not long and not seam"
-
-test-long: .venv/.installed-test
-	$(BIN)/python -m pytest -m long
+	$(BIN)/python -m pytest -m "not seam"
 
 check: .venv/.installed-test
 	$(BIN)/ruff check .

@@ -196,6 +196,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from trainer.store import Store
 
     config = _config(arguments)
+    if arguments.json is not None:
+        _check_output(arguments.json, arguments.data_dir)
     demo = find_demo(arguments.demo, arguments.data_dir / "demos")
     store = Store(arguments.data_dir)
     try:
@@ -254,19 +256,22 @@ def _demo_show(arguments: argparse.Namespace) -> None:
 def _rater_add(arguments: argparse.Namespace) -> None:
     from app.links import issue_link, read_secret
 
+    name = arguments.name
+    if not 1 <= len(name.strip()) <= 64 or not name.isprintable():
+        raise UserError(f"a rater's name is 1 to 64 printable characters, got {name[:80]!r}")
     with _open_store(arguments) as store:
-        rater = store.ensure_rater(arguments.name, "researcher" if arguments.researcher else "annotator")
+        rater = store.ensure_rater(name.strip(), "researcher" if arguments.researcher else "annotator")
         print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
 
 
 def _rater_list(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments) as store:
+    with _open_store(arguments, must_exist=True) as store:
         for rater in store.raters():
             print(f"{rater.name:24} {rater.role}")
 
 
 def _rater_revoke(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments) as store:
+    with _open_store(arguments, must_exist=True) as store:
         raters = {rater.name: rater for rater in store.raters()}
         if arguments.name not in raters:
             raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
@@ -276,20 +281,31 @@ def _rater_revoke(arguments: argparse.Namespace) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     from app.exports import csv_blocks
+    from trainer.files import write_atomic
 
     with _open_store(arguments, must_exist=True) as store:
-        rows = store.iter_ratings(arguments.run_name)
+        run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
+        if run is not None and run not in runs:
+            raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
+        blocks = csv_blocks(store.iter_ratings(run))
         if arguments.out is None:
-            for block in csv_blocks(rows):
+            for block in blocks:
                 sys.stdout.buffer.write(block)
             sys.stdout.buffer.flush()
             return
-        try:
-            with arguments.out.open("wb") as file:
-                for block in csv_blocks(rows):
-                    file.write(block)
-        except OSError as error:
-            raise UserError(f"cannot write {arguments.out}: {error.strerror}") from None
+        _check_output(arguments.out, arguments.data_dir)
+        write_atomic(arguments.out, blocks)
+
+
+def _check_output(file: Path, data_dir: Path) -> None:
+    """Raises UserError, before any work is done, if a result could not be written there."""
+    if file.is_dir():
+        raise UserError(f"{file} is a directory; give the name of a file in it")
+    parent = file.absolute().parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise UserError(f"cannot write {file}: {parent} is not a directory that can be written to")
+    if parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
+        raise UserError(f"{file} is the database; choose another name")
 
 
 def _baseline_trpo(arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ a browser needs, so nothing else is passed on.
 from __future__ import annotations
 
 import asyncio
+import socket
 import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -51,6 +52,8 @@ _SECURITY_HEADERS = {
 
 _RATER = web.RequestKey("rater", Rater)
 _SESSION = web.RequestKey("session", str)
+_MOST_SESSIONS = 8
+"""Sessions of one browser that are looked at."""
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -75,6 +78,17 @@ class Inside(Protocol):
     port: int
     secret: str
     pictures: Pictures
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises UserError if the port cannot be opened now; to be called before anything is written."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise _explain(error, host, port) from None
 
 
 class Front:
@@ -136,7 +150,7 @@ class Front:
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._serve(ready))
-        except (OSError, OverflowError) as error:
+        except Exception as error:  # whatever it is: the caller must not believe the port open
             failure.append(error)
         finally:
             self._loop.run_until_complete(self._loop.shutdown_default_executor())
@@ -153,8 +167,8 @@ class Front:
                 self._port = runner.addresses[0][1]
                 ready.set()
                 await self._stop.wait()
-                for socket in tuple(self._sockets):
-                    await socket.close(code=1001)
+                for browser in tuple(self._sockets):
+                    await browser.close(code=1001)
         finally:
             await runner.cleanup()
 
@@ -162,7 +176,8 @@ class Front:
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
         app.add_routes(
             [
-                web.get("/", self._index),
+                web.get("/", self._home),
+                web.get(r"/r/{rater:\d{1,9}}", self._page_of),
                 web.get("/login", self._log_in),
                 web.get("/healthz", self._health),
                 web.get("/export.csv", self._export),
@@ -179,12 +194,7 @@ class Front:
     @web.middleware
     async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         try:
-            token = request.cookies.get(self._cookie)
-            if token is not None:
-                digest = hash_token(token)
-                rater = await asyncio.to_thread(self._store.rater_of, digest, "session")
-                if rater is not None:
-                    request[_RATER], request[_SESSION] = rater, digest
+            await self._recognise(request)
             if _RATER not in request and not _is_public(request.path):
                 response: web.StreamResponse = self._login_page(401)
             else:
@@ -198,10 +208,26 @@ class Front:
             raise response
         return response
 
-    @property
-    def _cookie(self) -> str:
+    async def _recognise(self, request: web.Request) -> None:
+        """Notes who asks. One browser may hold sessions of several raters, each with its own tabs."""
+        known: list[tuple[Rater, str]] = []
+        cookies = [value for name, value in request.cookies.items() if name.startswith(self._cookie(""))]
+        for token in cookies[:_MOST_SESSIONS]:
+            digest = hash_token(token)
+            rater = await asyncio.to_thread(self._store.rater_of, digest, "session")
+            if rater is not None:
+                known.append((rater, digest))
+        if "rater" in request.match_info:  # the page, and its WebSocket, of this rater alone
+            wanted = int(request.match_info["rater"])
+            known = [(rater, digest) for rater, digest in known if rater.id == wanted]
+        # Elsewhere the most that any of the sessions may do.
+        known.sort(key=lambda entry: entry[0].role != "researcher")
+        if known:
+            request[_RATER], request[_SESSION] = known[0]
+
+    def _cookie(self, rater: int | str) -> str:
         # Browsers share cookies between the ports of a host; two studies on one machine must not.
-        return f"onedemo-{self._port}"
+        return f"onedemo-{self._port}-{rater}"
 
     def _login_page(self, status: int) -> web.Response:
         notes = {
@@ -221,10 +247,10 @@ class Front:
             return self._login_page(403)
         session = new_session_token()
         await asyncio.to_thread(self._store.add_token, hash_token(session), rater.id, "session")
-        response = web.HTTPSeeOther("/")
+        response = web.HTTPSeeOther(f"/r/{rater.id}")
         # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
         response.set_cookie(
-            self._cookie,
+            self._cookie(rater.id),
             session,
             max_age=_SESSION_DAYS * 86400,
             httponly=True,
@@ -236,7 +262,10 @@ class Front:
 
     # What they get
 
-    async def _index(self, request: web.Request) -> web.StreamResponse:
+    async def _home(self, request: web.Request) -> web.StreamResponse:
+        raise web.HTTPSeeOther(f"/r/{request[_RATER].id}")
+
+    async def _page_of(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._socket(request)
         return web.Response(text=self._html, content_type="text/html")
@@ -288,8 +317,11 @@ class Front:
         blocks = exports.csv_blocks(self._store.iter_ratings())
         # One thread for the whole export: a SQLite connection belongs to the thread that opened it.
         with ThreadPoolExecutor(max_workers=1) as reader:
-            while block := await self._loop.run_in_executor(reader, next, blocks, None):
-                await response.write(block)
+            try:
+                while block := await self._loop.run_in_executor(reader, next, blocks, None):
+                    await response.write(block)
+            finally:
+                await self._loop.run_in_executor(reader, blocks.close)
         await response.write_eof()
         return response
 

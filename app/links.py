@@ -21,9 +21,16 @@ SECRET_FILE = "link-secret"
 SECRET_BYTES = 32
 
 
-def link_token(secret: bytes, rater: Rater) -> str:
-    """The token in a rater's link: 43 URL-safe characters that cannot be guessed without the secret."""
-    digest = hmac.new(secret, f"onedemo link {rater.id} {rater.name}".encode(), hashlib.sha256).digest()
+def link_token(secret: bytes, rater: Rater, generation: int = 0) -> str:
+    """The token in a rater's link: 43 URL-safe characters that cannot be guessed without the secret.
+
+    Args:
+        secret: From ``read_secret``.
+        rater: Whom the link is for.
+        generation: How many earlier links of this rater were revoked.
+    """
+    text = f"onedemo link {rater.id} {rater.name} {generation}"
+    digest = hmac.new(secret, text.encode(), hashlib.sha256).digest()
     return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
 
 
@@ -61,7 +68,7 @@ def read_secret(data_dir: Path) -> bytes:
 
 
 def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
-    """The link that lets a rater in, known to the store from now on.
+    """The link that lets a rater in, known to the store from now on: the same until it is revoked.
 
     Args:
         store: Keeps the hash of the token.
@@ -69,7 +76,7 @@ def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
         rater: Whom the link is for.
         base_url: Of the front, such as ``http://127.0.0.1:8080``.
     """
-    token = link_token(secret, rater)
+    token = link_token(secret, rater, store.count_revoked_links(rater.id))
     store.add_token(hash_token(token), rater.id, "link")
     return f"{base_url.rstrip('/')}/login?token={token}"
 

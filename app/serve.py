@@ -7,7 +7,7 @@ import signal
 import threading
 from pathlib import Path
 
-from app.front import Front
+from app.front import Front, check_port
 from app.links import issue_link, read_secret
 from app.server import Page
 from trainer.config import RunConfig
@@ -50,6 +50,7 @@ def serve(
     Raises:
         UserError: If the data directory, the port or the graphics library cannot be used.
     """
+    check_port(host, port)
     store = Store(data_dir)
     renderer = RenderThread()
     secret = read_secret(data_dir)

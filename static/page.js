@@ -8,6 +8,10 @@
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
+  // Viser writes its server into the address bar when the page has a path; here that is always ours.
+  const replaceState = history.replaceState.bind(history);
+  history.replaceState = (state, title) => replaceState(state, title, location.pathname);
+
   const shown = (selector) => document.querySelector(selector);
 
   function typing(target) {
@@ -52,6 +56,13 @@
     "keydown",
     (event) => {
       if (typing(event.target) || event.ctrlKey || event.metaKey) return;
+      if (/^Numpad[1-5]$/.test(event.code) && /^[1-5]$/.test(event.key)) {
+        // Viser's keys are those above the letters.
+        event.stopImmediatePropagation();
+        event.preventDefault();
+        if (!event.repeat) press(event.key);
+        return;
+      }
       const rating = /^[1-5sS]$/.test(event.key) && !event.altKey;
       const ours = rating || event.key === "u" || event.key === "U" || event.key === "Backspace";
       if (ours && (event.repeat || (rating && !pictureReady()))) {

@@ -30,7 +30,8 @@ CHROMIUM_FLAGS = [
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
-    path = next((p for p in ("/usr/bin/chromium", shutil.which("chromium")) if p and Path(p).exists()), None)
+    names = ("chromium", "chromium-browser")
+    path = next((found for name in names if (found := shutil.which(name))), None)
     if path is None:
         reason = "there is no Chromium: install the package chromium"
         if os.environ.get("CI"):

@@ -27,13 +27,21 @@ from trainer.store import FILE_NAME, RATING_COLUMNS, Store
         ("demo show nope", "no demo called 'nope'; known demos: hopper-backflip"),
         ("demo add nowhere.mp4 --name x", "no video file at nowhere.mp4"),
         ("demo add nowhere.mp4 --name x --crop 1,2", "four whole numbers X,Y,W,H, got '1,2'"),
-        ("rater revoke Nobody", "no rater 'Nobody'; there are: none"),
+        ("rater revoke Nobody", "no onedemo.sqlite3 in"),
         ("export", "no onedemo.sqlite3 in"),
+        ("rater list", "no onedemo.sqlite3 in"),
+        ("rater add  ", "a rater's name is 1 to 64 printable characters"),
+        ("serve --seed -1", "seed must be at least 0, got -1"),
+        ("train --set policy.hidden=[1.5]", "policy.hidden must be a list of whole numbers"),
+        ("train --set env=walker --quiet", "unknown environment 'walker'"),
+        ("train --json /", "/ is a directory"),
+        ("train --json /nowhere/out.json", "cannot write /nowhere/out.json"),
+        ("serve --host a..b", "cannot be opened"),
         ("nonsense", "invalid choice: 'nonsense'"),
     ],
 )
 def test_bad_input_is_one_sentence_and_code_2(arguments, sentence, tmp_path, capsys):
-    words = arguments.split()
+    words = arguments.split() if not arguments.endswith("  ") else [*arguments.split(), ""]
     if words[0] != "nonsense":
         words += ["--data-dir", str(tmp_path / "data")]
     assert main(words) == 2
@@ -53,7 +61,7 @@ def test_a_newer_database_stays_as_it_is(tmp_path, capsys):
 
 def test_a_data_directory_that_cannot_be_used(tmp_path, capsys):
     (tmp_path / "data").write_text("a file is in the way")
-    assert main(["rater", "list", "--data-dir", str(tmp_path / "data")]) == 2
+    assert main(["rater", "add", "Ann", "--data-dir", str(tmp_path / "data")]) == 2
     assert "not writable" in capsys.readouterr().err
 
 
@@ -70,6 +78,14 @@ def test_raters_get_links_and_lose_them(tmp_path, capsys):
     assert capsys.readouterr().out.split() == ["Ann", "annotator", "Bob", "researcher"]
     assert main(["rater", "revoke", "Ann", *where]) == 0
     assert "ended 1 links" in capsys.readouterr().out
+    assert main(["rater", "add", "Ann", *where]) == 0
+    assert capsys.readouterr().out.strip() not in (link, "")  # the old link stays dead
+    assert main(["rater", "revoke", "Nobody", *where]) == 2
+    assert "no rater 'Nobody'; there are: Ann, Bob" in capsys.readouterr().err
+    assert main(["export", "--run", "nope", *where]) == 2
+    assert "no run 'nope'; there are: none" in capsys.readouterr().err
+    assert main(["export", "--out", str(tmp_path / "onedemo.sqlite3"), *where]) == 2
+    assert "is the database" in capsys.readouterr().err
 
 
 def test_help_is_quick_and_loads_nothing_heavy():
@@ -82,13 +98,15 @@ def test_help_is_quick_and_loads_nothing_heavy():
 @pytest.mark.seam
 def test_the_headless_run_of_the_readme(tmp_path, capsys):
     out = tmp_path / "summary.json"
-    words = "train --demo hopper-backflip --rater oracle --ratings 40 --steps 20000 --seed 0"
+    words = "train --demo hopper-backflip --rater oracle --ratings 40 --steps 100000 --seed 0"
     assert main([*words.split(), "--data-dir", str(tmp_path), "--json", str(out)]) == 0
     shown = capsys.readouterr().out
     summary = json.loads(out.read_text())
     assert summary["ratings"] == sum(summary["ratings_by_class"]) == 40
-    assert summary["env_steps"] == 20_032 and summary["seed"] == 0
-    for key in ("predicted_similarity", "true_similarity", "net_turns", "clean_turns", "backflip_reward"):
+    assert summary["env_steps"] == 100_032 and summary["seed"] == 0 and summary["version"]
+    assert summary["wall_s"] < 240 and summary["steps_per_s"] > 0
+    figures = ("predicted_similarity", "true_similarity", "net_turns", "clean_turns")
+    for key in (*figures, "backflip_reward", "backflip_reward_raw_actions"):
         assert set(summary[key]) == {"mean", "best", "worst"} and key in shown
     assert main(["export", "--data-dir", str(tmp_path), "--out", str(tmp_path / "r.csv")]) == 0
     with (tmp_path / "r.csv").open(newline="") as file:
@@ -116,9 +134,10 @@ def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(servin
     assert all(link.startswith(f"http://127.0.0.1:{port}/login?token=") for link in links.values())
     second, none, log = serving.start("--port", str(port))
     assert second.wait(30) == 2 and not none
-    assert "another onedemo is working on" in log.read_text()
-    other, none, log = serving.start("--port", str(port), "--new-run")
-    assert other.wait(30) == 2 and not none
     assert f"port {port}" in log.read_text() and "--port" in log.read_text()
+    other, none, log = serving.start("--port", "0")
+    assert other.wait(30) == 2 and not none
+    assert "another onedemo is working on" in log.read_text()
+    assert len(list(serving.data_dir.glob("runs/*"))) == 1  # a start that failed leaves no run
     child.terminate()
     assert child.wait(60) == 0

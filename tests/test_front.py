@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import socket
+from pathlib import Path
 
 import aiohttp
 import pytest
@@ -12,7 +12,8 @@ import viser
 from aside import run
 
 from app import exports
-from app.front import Front
+from app.front import Front, check_port
+from app.links import issue_link, read_secret
 from trainer.errors import UserError
 from trainer.store import RATING_COLUMNS
 
@@ -34,17 +35,19 @@ def fetch(url, path, *, link=None, cookies=None, headers=None, follow=True):
     return run(go())
 
 
-def connect(url, *, link=None, headers=None):
+def connect(url, *, link=None, headers=None, path=None):
     """Opens the WebSocket as a browser would and returns the status, 101 if it was let in."""
 
     async def go():
         jar = aiohttp.CookieJar(unsafe=True)
         async with aiohttp.ClientSession(cookie_jar=jar) as session:
+            page = f"{url}/r/1"
             if link:
-                await (await session.get(link)).read()
+                async with session.get(link) as response:
+                    page = str(response.url)
             try:
                 async with session.ws_connect(
-                    url + "/",
+                    page if path is None else url + path,
                     protocols=[f"viser-v{viser.__version__}"],
                     headers={"Origin": url} if headers is None else headers,
                 ) as socket:
@@ -67,7 +70,7 @@ def test_nothing_without_a_session(site, path):
     assert status == 401
     assert b"Please open your link" in body
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
-    assert fetch(site.url, path, cookies={f"onedemo-{site.front.port}": "guess"})[0] == 401
+    assert fetch(site.url, path, cookies={f"onedemo-{site.front.port}-1": "guess"})[0] == 401
 
 
 def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
@@ -82,7 +85,7 @@ def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
 
 def test_link_becomes_a_cookie_that_scripts_cannot_read(site):
     status, headers, _, _ = fetch(site.url, site.links["annotator"].removeprefix(site.url), follow=False)
-    assert (status, headers["Location"]) == (303, "/")
+    assert (status, headers["Location"]) == (303, "/r/2")
     cookie = headers["Set-Cookie"]
     assert "HttpOnly" in cookie and "SameSite=Lax" in cookie
     assert headers["Referrer-Policy"] == "no-referrer"
@@ -148,6 +151,7 @@ def test_websocket_needs_session_and_own_origin(site):
     assert connect(site.url, link=link) == 101
     assert connect(site.url, link=link, headers={"Origin": "http://elsewhere.example"}) == 403
     assert connect(site.url, link=link, headers={}) == 403
+    assert connect(site.url, link=link, path="/r/1") == 401  # somebody else's
 
 
 def test_port_in_use_is_one_clear_sentence(site):
@@ -156,8 +160,26 @@ def test_port_in_use_is_one_clear_sentence(site):
 
 
 def test_viser_is_on_the_loopback_only(site):
-    with pytest.raises(OSError):
-        host = socket.gethostbyname(socket.gethostname())
-        if host.startswith("127."):
-            raise OSError("this machine has no other address")
-        socket.create_connection((host, site.page.port), timeout=1)
+    tables = [Path(f"/proc/net/{name}").read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    sockets = [line.split() for table in tables for line in table]
+    listening = [row[1].split(":") for row in sockets if row[3] == "0A"]
+    at = {address for address, port in listening if int(port, 16) == site.page.port}
+    assert at == {"0100007F"}  # 127.0.0.1, and nothing else
+
+
+def test_a_revoked_rater_gets_another_link(site):
+    store = site.trainer.store
+    bo = next(r for r in store.raters() if r.name == "bo")
+    store.revoke_tokens(bo.id)
+    again = issue_link(store, read_secret(store.path.parent), bo, site.url)
+    assert again != site.links["annotator"]
+    assert fetch(site.url, "/", link=again)[0] == 200
+    assert fetch(site.url, "/", link=site.links["annotator"])[0] == 401
+
+
+@pytest.mark.parametrize(("host", "port"), [("a..b", 0), ("203.0.113.1", 0)])
+def test_a_host_that_cannot_be_listened_on(site, host, port):
+    with pytest.raises(UserError, match="cannot be opened"):
+        check_port(host, port)
+    with pytest.raises(UserError, match="cannot be opened"):
+        Front(site.trainer, site.page, host=host, port=port).start()

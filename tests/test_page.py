@@ -106,6 +106,48 @@ def test_annotator_rates_by_key_button_and_slider_and_researcher_downloads_it(ch
         assert all(300 <= int(row["latency_ms"]) < 60_000 for row in rows)
 
 
+def test_tabs_of_one_browser_keep_their_own_rater(chromium, site):
+    with opened(chromium, site.links["annotator"]) as first:
+        second = first.context.new_page()
+        second.goto(site.links["researcher"])
+        second.wait_for_selector(".od-header")
+        first.reload()
+        first.wait_for_selector(".od-header")
+        assert first.locator(".od-name").inner_text() == "bo"
+        assert second.locator(".od-name").inner_text() == "ada"
+        assert "websocket" not in first.url
+        clip = shown_clip(first)
+        assert press_and_wait(first, site, lambda: first.keyboard.press("Shift+Numpad4")) == (
+            "rate",
+            clip,
+            4,
+            "bo",
+        )
+
+
+@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_no_tab_is_wider_than_the_screen(chromium, site, viewport):
+    store = site.trainer.store
+    long_name = store.ensure_rater("Annabella-Victoria of a Long Name", "annotator")
+    store.rate(1, long_name.id, 3, 900)
+    with opened(chromium, site.links["researcher"], viewport) as page:
+        for tab, content in (
+            ("Rate", ".od-clip"),
+            ("Data", ".od-data"),
+            ("Guide", ".od-example img"),
+            ("Watch", ".od-strip"),
+        ):
+            page.click(f'.od-tabs >> text="{tab}"')
+            page.wait_for_selector(content, timeout=60_000)
+            page.wait_for_timeout(300)
+            right = page.evaluate(
+                "() => Math.max(...[...document.querySelectorAll('[class*=od-]')]"
+                ".filter(e => !e.closest('.od-scroll, .od-preload, .od-side, .od-view') && e.offsetParent)"
+                ".map(e => e.getBoundingClientRect().right))"
+            )
+            assert right <= viewport["width"], (tab, right)
+
+
 def test_held_key_gives_one_rating(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         clip = shown_clip(page)

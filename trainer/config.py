@@ -78,6 +78,10 @@ class RunConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
 
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, got {self.seed}")
+
 
 def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> RunConfig:
     """The defaults, changed by a TOML file, changed by overrides.
@@ -175,9 +179,9 @@ def _fit(key: str, value: Any, hint: Any) -> Any:
             names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
             raise UserError(f"{key} must be {names[hint]}, got {value!r}")
         return value
-    if isinstance(value, list):
-        return tuple(value)
-    return value
+    if not isinstance(value, list) or not all(type(item) is int for item in value):
+        raise UserError(f"{key} must be a list of whole numbers, got {value!r}")
+    return tuple(value)
 
 
 def _at_least(config: Any, section: str, **minima: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,12 +15,12 @@ _UMASK = os.umask(0)  # there is no way to ask without setting; once, before the
 os.umask(_UMASK)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
     """Writes a file to a temporary name, syncs and renames it: a reader never sees half of it.
 
     Args:
         path: Where; missing directories are made.
-        data: The whole content.
+        data: The whole content, in one piece or in several.
 
     Raises:
         OSError: If the disk is full or the directory not writable; the old file is then untouched.
@@ -30,7 +30,8 @@ def write_atomic(path: Path, data: bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             os.fchmod(handle, 0o666 & ~_UMASK)  # mkstemp makes files that nobody else can read
-            file.write(data)
+            for block in (data,) if isinstance(data, bytes) else data:
+                file.write(block)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

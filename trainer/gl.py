@@ -20,14 +20,14 @@ _OFF = ("disable", "disabled", "off", "false", "0")
 def choose_backend() -> str:
     """Sets ``MUJOCO_GL``: EGL where its library loads, else off. Call before importing MuJoCo.
 
-    A value set by the user is kept, unless it asks for an EGL library that does not load: then
-    pictures are off, and ``open_context`` says why.
+    Only "off" is taken from the user: with any other backend whose library is missing, the import
+    of MuJoCo itself would fail. Where pictures are off, ``open_context`` says why.
 
     Returns:
         The value of ``MUJOCO_GL``; "" on systems whose own window library needs no choice.
     """
     wanted = os.environ.get("MUJOCO_GL", "")
-    if sys.platform != "linux" or wanted not in ("", "egl"):
+    if sys.platform != "linux" or wanted.lower() in _OFF:
         return wanted
     os.environ["MUJOCO_GL"] = "egl" if _libegl_loads() else "disable"
     return os.environ["MUJOCO_GL"]

@@ -44,13 +44,7 @@ class Learner:
         spec = envs.spec(config.env)
         self.config = config
         self.dt = spec.dt
-        self.demo_steps = int(frames / fps / spec.dt + 1e-6)
-        self.clip_steps = int(config.ratings.clip_seconds / spec.dt + 0.5)
-        if self.demo_steps < self.clip_steps:
-            raise UserError(
-                f"the demo lasts {frames / fps:.2f} s, shorter than a clip of "
-                f"{config.ratings.clip_seconds} s; use a longer video or a smaller ratings.clip_seconds"
-            )
+        self.demo_steps, self.clip_steps = lengths(config, frames, fps)
         self.iteration = 0
         self.env_steps = 0
         self._visual: np.ndarray | None = None
@@ -149,3 +143,24 @@ class Learner:
     def _make_collector(self, lanes: int, *, seed: int, stagger: bool) -> Collector:
         env = envs.make(self.config.env, lanes, horizon=self.demo_steps, nthread=self.config.rollouts.threads)
         return Collector(env, seed=seed, stagger=stagger)
+
+
+def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:
+    """Control steps of a demo and of a clip.
+
+    Args:
+        config: Names the robot and the length of a clip.
+        frames: How many frames the demo has.
+        fps: Frames per second of the demo.
+
+    Raises:
+        UserError: If the robot is unknown or the demo is shorter than a clip.
+    """
+    dt = envs.spec(config.env).dt
+    demo, clip = int(frames / fps / dt + 1e-6), int(config.ratings.clip_seconds / dt + 0.5)
+    if demo < clip:
+        raise UserError(
+            f"the demo lasts {frames / fps:.2f} s, shorter than a clip of "
+            f"{config.ratings.clip_seconds} s; use a longer video or a smaller ratings.clip_seconds"
+        )
+    return demo, clip

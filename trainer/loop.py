@@ -91,6 +91,7 @@ class Trainer:
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
+        self._control = threading.Lock()
         self._thread: threading.Thread | None = None
         self._work_began = self._work_s = 0.0
         self._status = Status(
@@ -106,6 +107,8 @@ class Trainer:
     def start(self) -> None:
         """Starts the thread; a run that was stopped goes on from its checkpoint."""
         self._stop.clear()
+        if self._status.phase == "stopped":
+            self._tell("starting", "The run goes on from its last checkpoint.")
         self._thread = threading.Thread(target=self.work, name="trainer", daemon=True)
         self._thread.start()
 
@@ -115,11 +118,12 @@ class Trainer:
 
     def resume(self) -> None:
         """Goes on after ``pause`` or ``stop``, and tries again after a failure."""
-        self._pause.clear()
-        self._retry.set()
-        if self._stop.is_set() and self._thread is not None:
-            self._thread.join()
-            self.start()
+        with self._control:  # two pages may press at once
+            self._pause.clear()
+            self._retry.set()
+            if self._stop.is_set() and self._thread is not None:
+                self._thread.join()
+                self.start()
 
     def stop(self, timeout_s: float = 60.0) -> None:
         """Ends the run's thread after the iteration in hand; the checkpoint stays."""
@@ -154,9 +158,9 @@ class Trainer:
                 self._work()
                 return
             except Exception as error:
-                log.exception("run %s: the trainer failed", self.run)
                 if self._simulated is not None:
                     raise
+                log.exception("run %s: the trainer failed", self.run)
                 self._rest_after(error)
 
     def final_policy(self) -> tuple[Learner, Snapshot | None]:
@@ -168,7 +172,7 @@ class Trainer:
         learner = self._prepare()
         limit = self.config.rollouts.total_steps
         while not self._stop.is_set():
-            self._ask(learner, resting=self._pause.is_set())
+            self._ask(learner)
             if learner.env_steps >= limit:
                 self._tell("done", "The agent has practised as long as it was told to.")
                 if self._simulated is not None:
@@ -248,25 +252,23 @@ class Trainer:
         self.store.set_predictions(number, {i: p for i, p in predicted.items() if p is not None})
         return True
 
-    def _ask(self, learner: Learner, *, resting: bool = False) -> None:
+    def _ask(self, learner: Learner) -> None:
         """Cuts as many clips as are missing from the queue, from the newest rollouts.
 
-        After pretraining the first online clips wait for the first iteration, unless none will come
-        because the trainer is ``resting``.
+        While the first iteration runs people go on with the random policy, so that nobody waits.
         """
         if self._clips is not None:
             self._clips.retry()
         if self._pool is None:  # resumed: the first iteration brings them
             return
+        # Waiting before given: a press in between must not count in neither.
+        waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
         given, missing = self._ratings(), 0
         if self._simulated is not None:
             missing = self._due(learner) - given
         elif given < self._status.target_ratings:
-            stage_end = self._status.target_ratings
-            if learner.iteration == 0 and not resting:
-                stage_end = self.config.ratings.pretrain
-            waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
-            missing = min(self.config.ratings.queue, stage_end - given) - len(waiting)
+            queue = min(self.config.ratings.queue, self._status.target_ratings - given)
+            missing = queue - len(waiting)
         if missing <= 0:
             return
         # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
@@ -305,7 +307,7 @@ class Trainer:
         return ratings.pretrain + round(ratings.online * min(1.0, learner.env_steps / span))
 
     def _withdraw_stale(self, learner: Learner) -> None:
-        oldest = learner.iteration - self.config.ratings.stale_iterations
+        oldest = max(1, learner.iteration - self.config.ratings.stale_iterations)
         stale = [c.id for c in self.store.waiting_clips(self.run) if c.iteration < oldest]
         self.store.set_clip_state(stale, "withdrawn")
 
@@ -336,7 +338,7 @@ class Trainer:
         while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
             try:
                 if self._learner is not None:
-                    self._ask(self._learner, resting=True)
+                    self._ask(self._learner)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")

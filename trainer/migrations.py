@@ -103,6 +103,18 @@ STEPS: tuple[str, ...] = (
 )
 
 
+def check_version(connection: sqlite3.Connection) -> int:
+    """The schema version of a database; reads only.
+
+    Raises:
+        ValueError: If the database was made by a newer program.
+    """
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if version > len(STEPS):
+        raise ValueError(f"schema version {version}, this program knows versions up to {len(STEPS)}")
+    return version
+
+
 def migrate(connection: sqlite3.Connection) -> None:
     """Brings a database to the newest version, all steps or none of each.
 
@@ -112,8 +124,6 @@ def migrate(connection: sqlite3.Connection) -> None:
     Raises:
         ValueError: If the database was made by a newer program.
     """
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version > len(STEPS):
-        raise ValueError(f"schema version {version}, this program knows versions up to {len(STEPS)}")
+    version = check_version(connection)
     for number, step in enumerate(STEPS[version:], start=version + 1):
         connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")

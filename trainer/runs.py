@@ -10,6 +10,7 @@ from trainer.config import RunConfig, load_config, to_toml
 from trainer.demo_checks import check_name
 from trainer.errors import UserError
 from trainer.files import write_atomic
+from trainer.learner import lengths
 from trainer.records import Demo
 from trainer.store import Store
 
@@ -66,8 +67,10 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         name: What to call it, or None: ``<demo>-<number>``.
 
     Raises:
-        UserError: If the name is taken or cannot be the name of a directory.
+        UserError: If the demo is shorter than a clip, the robot is unknown, or the name is taken or
+            cannot be the name of a directory.
     """
+    lengths(config, demo.frames, demo.fps)
     if name is not None:
         check_name(name)
     else:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.errors import UserError
-from trainer.migrations import migrate
+from trainer.migrations import check_version, migrate
 from trainer.records import Clip, Rater, Segment
 
 FILE_NAME = "onedemo.sqlite3"
@@ -75,6 +75,7 @@ class Store:
                 f"the data directory {data_dir} is not writable ({error}); choose another with --data-dir"
             ) from None
         try:
+            check_version(self._db)  # before anything is written
             self._db.execute("PRAGMA journal_mode = WAL")
             self._db.execute("PRAGMA synchronous = FULL")
             self._db.execute("PRAGMA foreign_keys = ON")
@@ -142,6 +143,13 @@ class Store:
             (token_hash, kind),
         )
         return Rater(id=rows[0][0], name=rows[0][1], role=rows[0][2]) if rows else None
+
+    def count_revoked_links(self, rater_id: int) -> int:
+        """How many links of a rater were ended."""
+        return self._rows(
+            "SELECT COUNT(*) FROM tokens WHERE rater_id = ? AND kind = 'link' AND revoked_at IS NOT NULL",
+            (rater_id,),
+        )[0][0]
 
     def revoke_tokens(self, rater_id: int) -> int:
         """Ends every link and session of a rater; returns how many."""
@@ -393,7 +401,8 @@ class Store:
             try:
                 yield self._db
             except BaseException:
-                self._db.execute("ROLLBACK")
+                if self._db.in_transaction:  # SQLite ends it by itself on a full disk, say
+                    self._db.execute("ROLLBACK")
                 raise
             self._db.execute("COMMIT")
 
