@@ -56,8 +56,9 @@ def rate_all(store, run, rater, value=3):
             store.rate(clip.id, rater.id, value, latency_ms=5)
 
 
-def test_a_headless_run_gives_its_summary(store, demo):
-    summary = train(
+def headless(store, demo):
+    """A whole run rated by the oracle; its summary."""
+    return train(
         store=store,
         data_dir=store.path.parent,
         demo=demo,
@@ -65,6 +66,10 @@ def test_a_headless_run_gives_its_summary(store, demo):
         encoder=Thumbnail(),
         progress=False,
     )
+
+
+def test_a_headless_run_gives_its_summary(store, demo):
+    summary = headless(store, demo)
     assert summary["ratings"] == sum(summary["ratings_by_class"]) == 18
     assert summary["env_steps"] == 2400
     for key in (
@@ -80,14 +85,7 @@ def test_a_headless_run_gives_its_summary(store, demo):
 
 
 def test_every_reward_can_be_traced_to_ratings(store, demo):
-    summary = train(
-        store=store,
-        data_dir=store.path.parent,
-        demo=demo,
-        config=small_config(),
-        encoder=Thumbnail(),
-        progress=False,
-    )
+    summary = headless(store, demo)
     run = summary["run"]
     snapshots = {row["number"]: row for row in store.snapshots(run)}
     for iteration in store.iterations(run):
@@ -189,11 +187,11 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
     trainer_.stop()
 
 
-def test_a_half_written_checkpoint_is_never_read(store, demo):
+def test_a_run_leaves_no_temporary_file(store, demo):
     trainer_ = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
     trainer_.work()
     files = [p.name for p in trainer_.directory.rglob("*") if p.is_file()]
-    assert not [name for name in files if name.startswith(".")]  # no temporary file is left
+    assert not [name for name in files if name.startswith(".")]
 
 
 # Nothing that learns can reach the demo's hidden states.

@@ -261,7 +261,7 @@ class Trainer:
             self._clips.retry()
         if self._pool is None:  # resumed: the first iteration brings them
             return
-        # Waiting before given: a press in between must not count in neither.
+        # Waiting is read before given, so that a press in between is missing from neither.
         waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
         given, missing = self._ratings(), 0
         if self._simulated is not None:
