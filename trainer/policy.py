@@ -239,7 +239,11 @@ class Policy(nn.Module):
 
     def log_prob(self, inputs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Log density of actions (B, a) at inputs (B, f), in nats: (B,)."""
-        z = (actions - self(inputs)) * torch.exp(-self.log_std)
+        return self.log_prob_of(self(inputs), actions)
+
+    def log_prob_of(self, mean: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Log density of actions (B, a) around mean actions (B, a), in nats: (B,)."""
+        z = (actions - mean) * torch.exp(-self.log_std)
         return (-0.5 * z**2 - self.log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def observe(self, obs: np.ndarray, clock: np.ndarray) -> None:
