@@ -146,6 +146,7 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
         "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE",
         help="one setting, such as trpo.max_kl=0.02; may be repeated",
     )  # fmt: skip
+    parser.add_argument("--device", metavar="NAME", help="of predictor and policy: cpu (default) or cuda")
     parser.add_argument("--encoder", metavar="NAME", help="efficientnet-lite0 (default) or vgg16")
     parser.add_argument("--encoder-weights", type=Path, metavar="FILE", help="instead of fetching them")
 
@@ -154,7 +155,7 @@ def _config(arguments: argparse.Namespace) -> Any:
     from trainer.config import load_config, parse_override
 
     overrides = dict(parse_override(text) for text in arguments.settings)
-    for key in ("seed", "encoder"):
+    for key in ("seed", "device", "encoder"):
         if getattr(arguments, key) is not None:
             overrides[key] = getattr(arguments, key)
     ratings = getattr(arguments, "ratings", None)
@@ -179,7 +180,10 @@ def _serve(arguments: argparse.Namespace) -> None:
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
         config=config,
         explicit=bool(arguments.settings)
-        or any(given is not None for given in (arguments.config, arguments.seed, arguments.encoder)),
+        or any(
+            given is not None
+            for given in (arguments.config, arguments.seed, arguments.device, arguments.encoder)
+        ),
         encoder_weights=arguments.encoder_weights,
         host=arguments.host,
         port=arguments.port,

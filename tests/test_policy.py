@@ -108,6 +108,19 @@ def test_snapshot_acts_as_the_network():
     np.testing.assert_allclose(samples.mean(0), mean, atol=0.1)
 
 
+def test_a_snapshot_that_acts_in_torch_acts_as_the_one_in_numpy():
+    trained = policy()
+    obs, clock = np.random.default_rng(0).standard_normal((64, 11)), np.arange(64)
+    plain, torched = trained.snapshot(), trained.snapshot(on_device=True)
+    inputs = plain.inputs(obs, clock)
+    acts = [snapshot.act(inputs, np.random.default_rng(1)) for snapshot in (plain, torched)]
+    np.testing.assert_allclose(*acts, atol=1e-5)
+    before = torched.act(inputs)
+    with torch.no_grad():
+        trained.mean[-1].bias.add_(1.0)
+    np.testing.assert_array_equal(torched.act(inputs), before)
+
+
 def test_snapshot_does_not_change_when_the_policy_does():
     trained = policy()
     snapshot = trained.snapshot()

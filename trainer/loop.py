@@ -368,14 +368,15 @@ class Trainer:
         for row in reversed(self.store.snapshots(self.run)):
             file = self._snapshot_file(row["number"])
             if file.exists():
-                self._snapshot, self._fitted_event = Snapshot.load(file), row["last_event"]
+                self._snapshot = Snapshot.load(file, self.config.device)
+                self._fitted_event = row["last_event"]
                 return
 
     def _load_checkpoint(self, learner: Learner) -> bool:
         file = self.directory / "checkpoint.pt"
         if not file.exists():
             return False
-        saved = torch.load(file, weights_only=True)
+        saved = torch.load(file, weights_only=True, map_location="cpu")
         learner.load_state_dict(saved["learner"])
         # The process may have died between the file and the row.
         self.store.add_iteration(self.run, learner.iteration, **saved["row"])

@@ -114,7 +114,7 @@ class Trpo:
     def __init__(self, policy: Policy, config: TrpoConfig, *, seed: int, threads: int = 1) -> None:
         self.policy = policy
         self.config = config
-        self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed)
+        self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed).to(policy.device)
         self._parameters = [*policy.mean.parameters(), policy.log_std]
         # Fused: one pass over the parameters; they are few, and the calls would cost more than the sums.
         self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate, fused=True)
@@ -136,8 +136,9 @@ class Trpo:
         """
         if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
-        inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1)
-        actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1)
+        device = self.policy.device
+        inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1).to(device)
+        actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1).to(device)
         ended_NT = rollouts.terminated | rollouts.truncated
         values_NT, next_values_NT = self._values(rollouts, ended_NT)
         advantages_NT = gae(
@@ -152,8 +153,8 @@ class Trpo:
         returns_NT = advantages_NT + values_NT
         spread = advantages_NT.std() + 1e-8
         standard_NT = (advantages_NT - advantages_NT.mean()) / spread
-        advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten()
-        returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten()
+        advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten().to(device)
+        returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten().to(device)
         # All that is random is drawn here, in one order, whichever of the two below runs first.
         sample = self._permutation(len(inputs_Bf))[: self.config.fisher_samples]
         orders = [self._permutation(len(inputs_Bf)) for _ in range(self.config.value_epochs)]
@@ -190,17 +191,17 @@ class Trpo:
         self._generator.set_state(state["generator"])
 
     def _permutation(self, count: int) -> torch.Tensor:
-        return torch.randperm(count, generator=self._generator)
+        return torch.randperm(count, generator=self._generator).to(self.policy.device)
 
     def _values(self, rollouts: Rollouts, ended_NT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V before and after each step: one pass, as the state after a step is the next one's."""
         with torch.no_grad():
             whole = np.concatenate([rollouts.inputs, rollouts.next_inputs[:, -1:]], axis=1)
-            values_NT1 = self.value(torch.from_numpy(whole)).numpy()
+            values_NT1 = self.value(torch.from_numpy(whole).to(self.policy.device)).cpu().numpy()
             next_values_NT = values_NT1[:, 1:].copy()
             if ended_NT.any():
-                last = self.value(torch.from_numpy(rollouts.next_inputs[ended_NT]))
-                next_values_NT[ended_NT] = last.numpy()
+                last = torch.from_numpy(rollouts.next_inputs[ended_NT]).to(self.policy.device)
+                next_values_NT[ended_NT] = self.value(last).cpu().numpy()
         return values_NT1[:, :-1], next_values_NT
 
     def _improve(

@@ -15,7 +15,7 @@ import numpy as np
 from mujoco import rollout
 
 from trainer import envs
-from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, ratio
+from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
 
 LANES = 64
 _SPEC = envs.SPECS["hopper"]
@@ -128,13 +128,17 @@ def _against_envpool(turns: int, steps: int) -> list[Result]:
     try:
         import envpool
     except ImportError:
-        return [Skipped(name="physics_vs_envpool", reason="envpool is not installed: pip install -e '.[bench]'")]
+        return [
+            Skipped(name="physics_vs_envpool", reason="envpool is not installed: pip install -e '.[bench]'")
+        ]
     peer = envpool.make_gymnasium("Hopper-v4", num_envs=LANES, num_threads=cores(), seed=0)
     env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
     env.reset(seed=0)
     peer.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, LANES, _SPEC.action_size))
-    rates = by_turns({"ours": lambda: _rate(env.step, actions), "envpool": lambda: _rate(peer.step, actions)}, turns)
+    rates = by_turns(
+        {"ours": lambda: _rate(env.step, actions), "envpool": lambda: _rate(peer.step, actions)}, turns
+    )
     env.close()
     peer.close()
     return [

@@ -51,7 +51,11 @@ def best_of_stock_envs(config: TrpoConfig, batch: int, quick: bool) -> tuple[Sto
             theirs = Theirs(config, batch if not quick else batch // 4, make, threads)
             rate = max(theirs.run() for _ in range(1 if quick else 2))
             theirs.close()
-            tried.append(StockEnv(name=f"{name} of {count}, torch threads {threads}", make=make, threads=threads, rate=rate))
+            tried.append(
+                StockEnv(
+                    name=f"{name} of {count}, torch threads {threads}", make=make, threads=threads, rate=rate
+                )
+            )
     words = ", ".join(f"{each.name}: {each.rate:,.0f}" for each in tried)
     return max(tried, key=lambda each: each.rate), f"{words} steps/s"
 

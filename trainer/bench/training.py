@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 
 from trainer import envs
-from trainer.bench.physics import Bare, cores, full_states
 from trainer.bench.figures import Result, Skipped, by_turns, ratio, single
+from trainer.bench.physics import Bare, cores, full_states
 from trainer.config import RunConfig, load_config
 from trainer.learner import Learner
 from trainer.policy import Policy, PolicyConfig
@@ -83,7 +82,9 @@ def learner_and_snapshot(config: RunConfig, ratings: int = 350) -> tuple[Learner
 
 
 def _against_physics(turns: int) -> list[Result]:
-    config = load_config(None, {"rollouts.lanes": LANES, "rollouts.steps": STEPS, "rollouts.threads": cores()})
+    config = load_config(
+        None, {"rollouts.lanes": LANES, "rollouts.steps": STEPS, "rollouts.threads": cores()}
+    )
     learner, snapshot = learner_and_snapshot(config)
     bare = Bare(LANES)
     latest: list[Any] = []
@@ -112,7 +113,7 @@ def _against_physics(turns: int) -> list[Result]:
             "train_vs_physics", f"training: collection, scoring, TRPO update, {LANES} x {STEPS} steps",
             ours=rates["ours"], theirs=rates["bare"], against=f"mujoco.rollout bare, {cores()} threads",
             reach=0.75, unit="steps/s",
-            equal="each turn, bare physics steps the same lanes with the same actions as the iteration before",
+            equal="each turn, bare physics steps the lanes of the iteration before with the same actions",
         ),
         single(
             "reward_share", "learned reward, share of an iteration's time", shares[1:], unit="%", reach=3.0,
