@@ -18,6 +18,8 @@ from trainer import envs
 from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
 
 LANES = 64
+MISSING = "{} is not installed: pip install -e '.[bench]'"
+"""Why a comparison was skipped."""
 _SPEC = envs.SPECS["hopper"]
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
@@ -146,7 +148,7 @@ def _against_envpool(turns: int, steps: int) -> list[Result]:
             "physics_vs_envpool", "the same, episodes that end at a fall",
             ours=rates["ours"], theirs=rates["envpool"], against=f"envpool {envpool.__version__} Hopper-v4",
             reach=1.0, unit="steps/s",
-            equal=f"{LANES} lanes, {cores()} threads, the same random actions, both end and restart at a fall",
+            equal=f"{LANES} lanes, {cores()} threads, the same random actions, both restart after a fall",
         )
     ]  # fmt: skip
 

@@ -15,7 +15,7 @@ import torch
 
 from trainer import envs
 from trainer.bench.figures import Result, Skipped, by_turns, ratio, single
-from trainer.bench.physics import Bare, cores, full_states
+from trainer.bench.physics import MISSING, Bare, cores, full_states
 from trainer.config import RunConfig, load_config
 from trainer.learner import Learner
 from trainer.policy import Policy, PolicyConfig
@@ -126,7 +126,7 @@ def _against_sb3(quick: bool) -> list[Result]:
     try:
         from trainer.bench import sb3
     except ImportError:
-        reason = "sb3-contrib is not installed: pip install -e '.[bench]'"
+        reason = MISSING.format("sb3-contrib")
         return [Skipped(name=name, reason=reason) for name in ("train_vs_sb3_best", "train_vs_sb3_same_env")]
     config = TrpoConfig(fisher_samples=LANES * STEPS // 2)
     turns = 2 if quick else 7
