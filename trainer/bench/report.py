@@ -182,8 +182,8 @@ def _facts(about: dict[str, Any]) -> str:
     packages = ", ".join(f"{name} {number}" for name, number in machine["packages"].items())
     return (
         f"`{about['command']}`, onedemo {about['version']}, {about['seconds']:.0f} s on "
-        f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, {packages}. Ratios are medians over turns "
-        "A B A B ...; least and most of all turns show the spread."
+        f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, {packages}. "
+        "Ratios are medians over turns A B A B ...; least and most of all turns show the spread."
     )
 
 
