@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version as package_version
+from importlib.metadata import version
 from typing import Any
 
 import gymnasium
@@ -15,8 +16,47 @@ from sb3_contrib import TRPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from trainer import envs
+from trainer.bench.figures import Result, by_turns, ratio
 from trainer.bench.physics import cores
-from trainer.trpo import TrpoConfig
+from trainer.bench.training import LANES, STEPS, one_thread
+from trainer.policy import Policy, PolicyConfig
+from trainer.rollouts import Collector
+from trainer.trpo import Trpo, TrpoConfig
+
+
+def measure(quick: bool = False) -> list[Result]:
+    """Our TRPO against sb3-contrib's on its best stock environment and on our batched one."""
+    with one_thread():
+        return _measure(quick)
+
+
+def _measure(quick: bool) -> list[Result]:
+    batch = LANES * STEPS
+    config = TrpoConfig(fisher_samples=batch // 2)
+    best, tried = best_of_stock_envs(config, batch, quick)
+    ours = _Ours(config)
+    theirs = Theirs(config, batch, best.make, best.threads)
+    same = Theirs(config, batch, lambda: OursAsVecEnv(LANES), best.threads)
+    rates = by_turns({"ours": ours.run, "best": theirs.run, "same": same.run}, 2 if quick else 9)
+    for side in (ours, theirs, same):
+        side.close()
+    equal = (
+        f"Hopper with stock reward and termination, 2 x 64 tanh, batches of {batch}, "
+        f"{config.cg_iterations} conjugate-gradient steps on half of the batch, {config.value_epochs} value "
+        f"epochs in minibatches of {config.value_batch}; ours also normalises observations and returns"
+    )
+    peer = f"sb3-contrib {version('sb3-contrib')}"
+    return [
+        ratio(
+            "train_vs_sb3_best", "TRPO training", ours=rates["ours"], theirs=rates["best"],
+            against=f"{peer} on {best.name}", reach=3.0, unit="steps/s", equal=f"{equal}; tried: {tried}",
+        ),
+        ratio(
+            "train_vs_sb3_same_env", "TRPO training", ours=rates["ours"], theirs=rates["same"],
+            against=f"{peer} on onedemo's batched Hopper, {LANES} lanes", reach=1.5, unit="steps/s",
+            equal=equal,
+        ),
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -29,11 +69,6 @@ class StockEnv:
     """Of torch."""
     rate: float
     """Steps per second in the trial."""
-
-
-def version() -> str:
-    """Name and version of the peer."""
-    return f"sb3-contrib {package_version('sb3-contrib')}"
 
 
 def best_of_stock_envs(config: TrpoConfig, batch: int, quick: bool) -> tuple[StockEnv, str]:
@@ -79,6 +114,8 @@ class Theirs:
     """
 
     def __init__(self, config: TrpoConfig, batch: int, make: Callable[[], VecEnv], threads: int) -> None:
+        # A last minibatch that is smaller than the others: ours has it, too.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
         env = make()
         self._batch, self._threads = batch // env.num_envs * env.num_envs, threads
         self._model = TRPO(
@@ -163,3 +200,24 @@ class OursAsVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No lane is wrapped."""
         return [False] * self.num_envs
+
+
+class _Ours:
+    """Our TRPO on the stock reward, an iteration at a time."""
+
+    def __init__(self, config: TrpoConfig) -> None:
+        self._env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
+        self._policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=1000, seed=0)
+        self._trpo = Trpo(self._policy, config, seed=0, threads=cores())
+        self._collector = Collector(self._env, seed=0)
+
+    def run(self) -> float:
+        """Steps per second of one iteration."""
+        began = time.perf_counter()
+        batch = self._collector.collect(self._policy.snapshot(), STEPS)
+        self._trpo.update(batch, batch.env_rewards)
+        return batch.clock.size / (time.perf_counter() - began)
+
+    def close(self) -> None:
+        """Ends the physics threads."""
+        self._env.close()

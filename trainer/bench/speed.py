@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 
 from trainer.bench.figures import Result, Skipped
+from trainer.bench.physics import MISSING
 
-PARTS = ("physics", "training", "fitting", "pictures", "data", "product", "warp")
+PARTS = ("physics", "training", "sb3", "fitting", "pictures", "data", "product", "warp")
 """Modules of ``trainer.bench``; each has ``measure(quick) -> list[Result]``."""
 
 
@@ -33,6 +34,8 @@ def measure(
         began = time.monotonic()
         try:
             results += importlib.import_module(f"trainer.bench.{part}").measure(quick)
+        except ImportError as error:
+            results.append(Skipped(name=part, reason=MISSING.format(error.name)))
         except Exception as error:
             results.append(Skipped(name=part, reason=f"it failed: {type(error).__name__}: {error}"))
         tell(f"{part}: {time.monotonic() - began:.0f} s")

@@ -1,4 +1,4 @@
-"""Training: iterations of TRPO on the learned reward beside bare physics, and beside sb3-contrib's TRPO.
+"""Training: iterations of TRPO on the learned reward beside bare physics.
 
 N lanes, T control steps, B = N T samples of an iteration.
 """
@@ -6,24 +6,20 @@ N lanes, T control steps, B = N T samples of an iteration.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
 
-from trainer import envs
-from trainer.bench.figures import Result, Skipped, by_turns, ratio, single
-from trainer.bench.physics import MISSING, Bare, cores, full_states
+from trainer.bench.figures import Result, by_turns, ratio, single
+from trainer.bench.physics import Bare, cores, full_states
 from trainer.config import RunConfig, load_config
 from trainer.learner import Learner
-from trainer.policy import Policy, PolicyConfig
 from trainer.predictor import Snapshot
 from trainer.records import Rollouts
-from trainer.rollouts import Collector
 from trainer.store import RatedSegment
-from trainer.trpo import Trpo, TrpoConfig
 
 LANES, STEPS = 64, 250
 """Of an iteration: the product's defaults."""
@@ -31,9 +27,9 @@ _FRAMES, _FPS = 240, 30.0
 
 
 def measure(quick: bool = False) -> list[Result]:
-    """Training beside bare physics and beside sb3-contrib; the learned reward's share."""
+    """Training beside bare physics, and the learned reward's share of it."""
     with one_thread():
-        return [*_against_physics(5 if quick else 25), *_against_sb3(quick)]
+        return _against_physics(5 if quick else 25)
 
 
 @contextmanager
@@ -120,54 +116,3 @@ def _against_physics(turns: int) -> list[Result]:
             how="the scoring of an iteration's rollouts, timed again by itself",
         ),
     ]  # fmt: skip
-
-
-def _against_sb3(quick: bool) -> list[Result]:
-    try:
-        from trainer.bench import sb3
-    except ImportError:
-        reason = MISSING.format("sb3-contrib")
-        return [Skipped(name=name, reason=reason) for name in ("train_vs_sb3_best", "train_vs_sb3_same_env")]
-    config = TrpoConfig(fisher_samples=LANES * STEPS // 2)
-    turns = 2 if quick else 7
-    best, tried = sb3.best_of_stock_envs(config, LANES * STEPS, quick)
-    sides: dict[str, Callable[[], float]] = {
-        "ours": _Ours(config).run,
-        "best": sb3.Theirs(config, LANES * STEPS, best.make, best.threads).run,
-        "same": sb3.Theirs(config, LANES * STEPS, lambda: sb3.OursAsVecEnv(LANES), best.threads).run,
-    }
-    rates = by_turns(sides, turns)
-    equal = (
-        f"Hopper with stock reward and termination, 2 x 64 tanh, batches of {LANES * STEPS}, "
-        f"{config.cg_iterations} conjugate-gradient steps on half of the batch, {config.value_epochs} value "
-        f"epochs in minibatches of {config.value_batch}; ours also normalises observations and returns"
-    )
-    version = sb3.version()
-    return [
-        ratio(
-            "train_vs_sb3_best", "TRPO training", ours=rates["ours"], theirs=rates["best"],
-            against=f"{version} on {best.name}", reach=3.0, unit="steps/s", equal=f"{equal}; tried: {tried}",
-        ),
-        ratio(
-            "train_vs_sb3_same_env", "TRPO training", ours=rates["ours"], theirs=rates["same"],
-            against=f"{version} on onedemo's batched Hopper, {LANES} lanes", reach=1.5, unit="steps/s",
-            equal=equal,
-        ),
-    ]  # fmt: skip
-
-
-class _Ours:
-    """Our TRPO on the stock reward, an iteration at a time."""
-
-    def __init__(self, config: TrpoConfig) -> None:
-        env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
-        self._policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=1000, seed=0)
-        self._trpo = Trpo(self._policy, config, seed=0, threads=cores())
-        self._collector = Collector(env, seed=0)
-
-    def run(self) -> float:
-        """Steps per second of one iteration."""
-        began = time.perf_counter()
-        batch = self._collector.collect(self._policy.snapshot(), STEPS)
-        self._trpo.update(batch, batch.env_rewards)
-        return batch.clock.size / (time.perf_counter() - began)
