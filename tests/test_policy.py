@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.policy import (
-    HARMONICS,
-    KINDS,
-    Normaliser,
-    Policy,
-    PolicyConfig,
-    ValueFunction,
-    feature_size,
-    mlp,
-    policy_inputs,
-)
+from trainer.inputs import HARMONICS, KINDS, feature_size, policy_inputs
+from trainer.policy import Normaliser, Policy, PolicyConfig, ValueFunction, mlp
 
 
 def policy(kind="clock", seed=0, table=None):

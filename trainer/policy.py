@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-KINDS = ("clock", "table", "pose", "raw")
-HARMONICS = (1, 2, 4, 8, 16)
+from trainer.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
+
 _CLIP = 10.0
 """Normalised inputs are clipped to +- this many standard deviations."""
 
@@ -45,80 +45,6 @@ class PolicyConfig:
             raise ValueError(f"policy.kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
         if not self.hidden or min(self.hidden) < 1:
             raise ValueError(f"policy.hidden must be positive layer widths, got {self.hidden}")
-
-
-def policy_inputs(
-    obs: np.ndarray,
-    clock: np.ndarray,
-    horizon: int,
-    kind: str,
-    table: np.ndarray | None = None,
-) -> np.ndarray:
-    """Features of a state and a demo time, not normalised.
-
-    Args:
-        obs: Observations, (..., o); index 1 is the torso angle in radians.
-        clock: Demo step of each, (...), 0 to horizon; later counts as horizon.
-        horizon: Demo steps in an episode.
-        kind: One of ``KINDS``.
-        table: For "table": what to show at each demo step, (H, k).
-
-    Returns:
-        Features, (..., f), float64: those of the state, then those of the time.
-
-    Raises:
-        ValueError: If the kind is unknown, or is "table" without one.
-    """
-    if kind not in KINDS:
-        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    state, time = state_features(obs, kind), time_features(horizon, kind, table)
-    if time is None:
-        return state
-    return np.concatenate([state, time[_rows(clock, time)]], axis=-1)
-
-
-def state_features(obs: np.ndarray, kind: str) -> np.ndarray:
-    """Features of a state alone.
-
-    The torso angle is unbounded (it counts turns), so every kind but "raw" shows it as sine and
-    cosine: the second flip then looks like the first.
-
-    Args:
-        obs: Observations, (..., o).
-        kind: One of ``KINDS``.
-
-    Returns:
-        (..., o) for "raw", else (..., o + 1), float64.
-    """
-    if kind == "raw":
-        return np.asarray(obs, np.float64)
-    angle = obs[..., 1:2]
-    return np.concatenate([obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]], axis=-1)
-
-
-def time_features(horizon: int, kind: str, table: np.ndarray | None = None) -> np.ndarray | None:
-    """Features of every demo step, one row each; None for kinds without time.
-
-    Raises:
-        ValueError: If the kind is "table" and there is none.
-    """
-    if kind == "clock":
-        u = np.arange(horizon + 1)[:, None] / horizon
-        phase = 2 * np.pi * u * np.asarray(HARMONICS)
-        return np.concatenate([2 * u - 1, np.sin(phase), np.cos(phase)], axis=1)
-    if kind == "table" and table is None:
-        raise ValueError('kind "table" needs a table (horizon, k)')
-    return table if kind == "table" else None
-
-
-def _rows(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
-    return np.clip(clock, 0, len(time) - 1)
-
-
-def feature_size(obs_size: int, kind: str, table_width: int = 0) -> int:
-    """How many features ``policy_inputs`` gives."""
-    extra = {"clock": 2 + 2 * len(HARMONICS), "table": 1 + table_width, "pose": 1, "raw": 0}
-    return obs_size + extra[kind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +75,7 @@ class PolicySnapshot:
         state = _normalise(features, self.mean[:width], self.std[:width])
         if self.time is None:
             return state
-        return np.concatenate([state, self.time[_rows(clock, self.time)]], axis=-1)
+        return np.concatenate([state, self.time[rows_of(clock, self.time)]], axis=-1)
 
     def act(self, inputs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Actions for normalised inputs.
