@@ -220,17 +220,46 @@ def read_frames(demo: Demo) -> np.ndarray:
     Raises:
         UserError: If the stored file is missing or damaged.
     """
+    return next(read_chunks(demo, demo.frames))
+
+
+def read_chunks(demo: Demo, length: int) -> Iterator[np.ndarray]:
+    """Decodes the demo's frames a few at a time, so that a long demo takes no more memory.
+
+    Args:
+        demo: The demo.
+        length: Frames in a chunk; the last may have fewer.
+
+    Yields:
+        Frames, (n, H, W, 3), uint8 RGB.
+
+    Raises:
+        UserError: If the stored file is missing or damaged.
+    """
+    count = 0
+    chunk = np.empty((0, 0, 0, 3), np.uint8)
     try:
         with VideoReader(demo.path) as reader:
-            frames = [frame for _, frame in reader.frames() if frame is not None]
+            for _, frame in reader.frames():
+                if count == demo.frames:  # more than there should be
+                    count += 1
+                    break
+                assert frame is not None, "none was skipped"
+                at = count % length
+                if at == 0:
+                    if count:
+                        yield chunk
+                    chunk = np.empty((min(length, demo.frames - count), *frame.shape), np.uint8)
+                chunk[at] = frame
+                count += 1
     except UserError:  # its advice is for videos on their way in
-        frames = []
-    if len(frames) != demo.frames:
+        pass
+    if count != demo.frames:
         raise UserError(
-            f"the stored video {demo.path} is missing or damaged: {len(frames)} of {demo.frames} frames "
+            f"the stored video {demo.path} is missing or damaged: {count} of {demo.frames} frames "
             "can be read; delete its directory and add the demo again"
         )
-    return np.stack(frames)
+    yield chunk
 
 
 def show(demo: Demo) -> str:
