@@ -95,6 +95,18 @@ def test_encoding_leaves_the_threads_of_torch_alone(efficientnet, frames):
         torch.set_num_threads(before)
 
 
+def test_frames_may_come_one_by_one_and_a_failure_between_them_is_told(efficientnet, frames):
+    wanted = efficientnet.encode(frames)
+    assert np.array_equal(efficientnet.encode(frame for frame in frames), wanted)
+
+    def broken():
+        yield from frames[:5]
+        raise UserError("the disk is gone")
+
+    with pytest.raises(UserError, match="the disk is gone"):
+        efficientnet.encode(broken())
+
+
 def test_efficientnet_prints_nothing(capfd, frames):
     EfficientNetLite0().encode(frames[:1])
     assert capfd.readouterr() == ("", "")
@@ -252,7 +264,7 @@ class Counting:
 
     def encode(self, frames):
         self.calls += 1
-        return frames.mean((1, 2), dtype=np.float32)
+        return np.array([frame.mean((0, 1), dtype=np.float32) for frame in frames])
 
 
 def test_features_are_computed_once_and_kept(demo, tmp_path):

@@ -212,7 +212,7 @@ def find_demo(name: str, demos_dir: Path) -> Demo:
 
 
 def read_frames(demo: Demo) -> np.ndarray:
-    """Decodes the demo's frames.
+    """Decodes the demo's frames, all at once.
 
     Returns:
         Frames, (n, H, W, 3), uint8 RGB.
@@ -220,38 +220,31 @@ def read_frames(demo: Demo) -> np.ndarray:
     Raises:
         UserError: If the stored file is missing or damaged.
     """
-    return next(read_chunks(demo, demo.frames))
+    frames = np.empty((0, 0, 0, 3), np.uint8)
+    for i, frame in enumerate(stream_frames(demo)):
+        if i == 0:
+            frames = np.empty((demo.frames, *frame.shape), np.uint8)
+        frames[i] = frame
+    return frames
 
 
-def read_chunks(demo: Demo, length: int) -> Iterator[np.ndarray]:
-    """Decodes the demo's frames a few at a time, so that a long demo takes no more memory.
-
-    Args:
-        demo: The demo.
-        length: Frames in a chunk; the last may have fewer.
+def stream_frames(demo: Demo) -> Iterator[np.ndarray]:
+    """Decodes the demo's frames one by one: a long demo takes no more memory than a short one.
 
     Yields:
-        Frames, (n, H, W, 3), uint8 RGB.
+        As many frames as the demo has, (H, W, 3), uint8 RGB.
 
     Raises:
-        UserError: If the stored file is missing or damaged.
+        UserError: If the stored file is missing or damaged; frames may have come before.
     """
     count = 0
-    chunk = np.empty((0, 0, 0, 3), np.uint8)
     try:
         with VideoReader(demo.path) as reader:
             for _, frame in reader.frames():
-                if count == demo.frames:  # more than there should be
-                    count += 1
-                    break
-                assert frame is not None, "none was skipped"
-                at = count % length
-                if at == 0:
-                    if count:
-                        yield chunk
-                    chunk = np.empty((min(length, demo.frames - count), *frame.shape), np.uint8)
-                chunk[at] = frame
                 count += 1
+                if frame is None or count > demo.frames:
+                    break
+                yield frame
     except UserError:  # its advice is for videos on their way in
         pass
     if count != demo.frames:
@@ -259,7 +252,6 @@ def read_chunks(demo: Demo, length: int) -> Iterator[np.ndarray]:
             f"the stored video {demo.path} is missing or damaged: {count} of {demo.frames} frames "
             "can be read; delete its directory and add the demo again"
         )
-    yield chunk
 
 
 def show(demo: Demo) -> str:

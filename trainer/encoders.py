@@ -8,11 +8,13 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+import itertools
 import logging
 import pickle
+import threading
 import urllib.error
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,19 +24,17 @@ import numpy as np
 import torch
 from torch import nn
 
-from trainer.demos import read_chunks
+from trainer.demos import stream_frames
 from trainer.errors import UserError
 from trainer.files import write_atomic
-from trainer.folded import Folded
+from trainer.folded import SIDE, Folded
 from trainer.records import Demo
 
 VGG16_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """ImageNet weights as published by torchvision (528 MB); the name ends in the file's SHA-256."""
 
-_SIDE = 224
 _BATCH = 4  # what the layers pass on stays in a core's cache; with 16 it takes twice as long
 _STREAMS = 8  # at most; each takes 40 MB
-_CHUNK = 32  # frames in memory at a time
 _log = logging.getLogger(__name__)
 
 
@@ -51,8 +51,8 @@ class Encoder(Protocol):
         """How many features per frame."""
         ...
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, d), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, d), float32, of (H, W, 3) uint8 RGB, each of any size."""
         ...
 
 
@@ -106,7 +106,7 @@ def demo_features(demo: Demo, encoder: Encoder, cache_dir: Path) -> np.ndarray:
             _log.warning("%s holds %s and not %s: made anew", path, features.shape, shape)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             _log.warning("%s is damaged (%s): made anew", path, error)
-    features = np.concatenate([encoder.encode(chunk) for chunk in read_chunks(demo, _CHUNK)])
+    features = encoder.encode(stream_frames(demo))
     if features.shape != shape or not np.isfinite(features).all():
         raise ValueError(f"{encoder.name} gave {features.shape}, wanted finite features {shape}")
     buffer = io.BytesIO()
@@ -125,12 +125,12 @@ class EfficientNetLite0:
     name = "efficientnet-lite0"
     dims = 1280
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, 1280), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, 1280), float32, of (H, W, 3) uint8 RGB, each of any size."""
         folded = self._folded
 
         def look(pixels_b3HW: torch.Tensor) -> torch.Tensor:
-            return folded((pixels_b3HW - 127) / 128).mean((2, 3))
+            return folded(pixels_b3HW.sub_(127).div_(128)).mean((2, 3))
 
         return _in_batches(frames, self.dims, look)
 
@@ -185,8 +185,8 @@ class Vgg16:
         self._maps = network["features"]
         self._fc7 = nn.Sequential(*list(network["classifier"].children())[:5])
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, 4096), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, 4096), float32, of (H, W, 3) uint8 RGB, each of any size."""
         # Means and deviations of ImageNet, as torchvision trains with.
         mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None] * 255
         deviation = torch.tensor([0.229, 0.224, 0.225])[:, None, None] * 255
@@ -273,7 +273,9 @@ def _fetch_vgg16() -> Any:
         ) from error
 
 
-def _in_batches(frames: np.ndarray, dims: int, look: Callable[[torch.Tensor], torch.Tensor]) -> np.ndarray:
+def _in_batches(
+    frames: Iterable[np.ndarray], dims: int, look: Callable[[torch.Tensor], torch.Tensor]
+) -> np.ndarray:
     """Scales frames to the network's input, passes them through and gathers the features.
 
     The whole picture is squeezed into the square: a centre crop, as in ImageNet tests, would cut
@@ -282,23 +284,36 @@ def _in_batches(frames: np.ndarray, dims: int, look: Callable[[torch.Tensor], to
     Each core takes small batches of its own. Sharing every layer of one batch among cores makes them
     wait for each other a hundred times a frame, and endlessly where other programs want the cores.
     """
-    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
-        raise ValueError(f"frames must be (n, H, W, 3) uint8, got {frames.shape} {frames.dtype}")
-    features = np.empty((len(frames), dims), np.float32)
+    waiting = iter(frames)
+    turn = threading.Lock()
+    batches: list[np.ndarray] = []
 
-    def work(at: int) -> None:
-        squares = [
-            cv2.resize(frame, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-            for frame in frames[at : at + _BATCH]
-        ]
+    def take() -> tuple[np.ndarray, int]:
+        with turn:  # the next frames may have to be decoded
+            squares = [_square(frame) for frame in itertools.islice(waiting, _BATCH)]
+            batches.append(np.empty((len(squares), dims), np.float32))
+            return np.array(squares), len(batches) - 1
+
+    def work() -> None:
         with torch.inference_mode():
-            pixels = torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float()
-            features[at : at + _BATCH] = look(pixels).numpy()
+            while True:
+                squares, place = take()
+                if not len(squares):
+                    return
+                pixels = torch.from_numpy(squares).permute(0, 3, 1, 2).float()
+                batches[place][:] = look(pixels).numpy()
 
     threads = torch.get_num_threads()
     cores = min(threads, _STREAMS)
     with ThreadPoolExecutor(cores, "encode", torch.set_num_threads, (1,)) as pool:
-        for future in [pool.submit(work, at) for at in range(0, len(frames), _BATCH)]:
-            future.result()
+        futures = [pool.submit(work) for _ in range(cores)]
     torch.set_num_threads(threads)  # the workers' setting is also that of threads yet to come
-    return features
+    for future in futures:
+        future.result()
+    return np.concatenate(batches)
+
+
+def _square(frame: np.ndarray) -> np.ndarray:
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ValueError(f"frames must be (H, W, 3) uint8, got {frame.shape} {frame.dtype}")
+    return cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
