@@ -27,14 +27,13 @@ from torch import nn
 from trainer.demos import stream_frames
 from trainer.errors import UserError
 from trainer.files import write_atomic
-from trainer.folded import SIDE, Folded
+from trainer.folded import BATCH, SIDE, Folded
 from trainer.records import Demo
 
 VGG16_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """ImageNet weights as published by torchvision (528 MB); the name ends in the file's SHA-256."""
 
-_BATCH = 4  # what the layers pass on stays in a core's cache; with 16 it takes twice as long
-_STREAMS = 8  # at most; each takes 40 MB
+_STREAMS = 8  # at most; each takes 30 MB
 _log = logging.getLogger(__name__)
 
 
@@ -290,7 +289,7 @@ def _in_batches(
 
     def take() -> tuple[np.ndarray, int]:
         with turn:  # the next frames may have to be decoded
-            squares = [_square(frame) for frame in itertools.islice(waiting, _BATCH)]
+            squares = [_square(frame) for frame in itertools.islice(waiting, BATCH)]
             batches.append(np.empty((len(squares), dims), np.float32))
             return np.array(squares), len(batches) - 1
 

@@ -19,7 +19,10 @@ from torch.nn import functional as F
 SIDE = 224
 """Rows and columns of the network's input."""
 
-_USUAL_BATCH = 4  # weights are laid out for it; other batches give the same, a little slower
+BATCH = 4
+"""Frames at a time for which it is made; other numbers give the same, a little slower."""
+
+_SMALL_SIDE = 28
 
 
 def has_fused() -> bool:
@@ -54,16 +57,25 @@ class Folded:
             stays = block._depthwise_conv.stride[0] == 1 and about.input_filters == about.output_filters
             self._blocks.append((layers, bool(block.id_skip and stays)))
         self._head = _Layer(network._conv_head, network._bn1, side, clamp=True, fused=fused)
+        sides = [layers[-1].side for layers, _ in self._blocks]
+        self._wide = next(i for i, side in enumerate(sides) if side <= _SMALL_SIDE) + 1
 
     def __call__(self, pixels_b3HW: torch.Tensor) -> torch.Tensor:
         """The last convolution's maps, (b, 1280, 7, 7), of scaled pixels. In inference mode only."""
-        x = self._stem(pixels_b3HW.contiguous(memory_format=torch.channels_last))
-        for layers, skip in self._blocks:
-            y = x
-            for layer in layers[:-1]:
-                y = layer(y)
-            x = layers[-1](y, x if skip else None)
-        return self._head(x)
+        # Wide maps one frame at a time: they stay in the core's cache. Small ones together: the
+        # weights, larger there, are read once for all.
+        frames = pixels_b3HW.contiguous(memory_format=torch.channels_last).split(1)
+        x = torch.cat([_through(self._blocks[: self._wide], self._stem(frame)) for frame in frames])
+        return self._head(_through(self._blocks[self._wide :], x))
+
+
+def _through(blocks: list[tuple[list[_Layer], bool]], x: torch.Tensor) -> torch.Tensor:
+    for layers, skip in blocks:
+        y = x
+        for layer in layers[:-1]:
+            y = layer(y)
+        x = layers[-1](y, x if skip else None)
+    return x
 
 
 class _Layer:
@@ -74,21 +86,28 @@ class _Layer:
             convolution.weight, convolution.bias, normalisation.running_mean, normalisation.running_var,
             normalisation.eps, normalisation.weight, normalisation.bias,
         )  # fmt: skip
-        # TensorFlow pads one more at the end than at the start. Taps of zero at the start of the
-        # kernel give the same with equal padding, and spare a copy of the whole input.
         start, end = getattr(convolution.static_padding, "padding", (0, 0))[:2]
-        more = end - start
-        weight = F.pad(weight.detach(), (more, 0, more, 0)).contiguous(memory_format=torch.channels_last)
+        weight = weight.detach()
+        self._pad = (0, 0, 0, 0)
+        if convolution.in_channels == 3:
+            self._pad, side, start, end = (start, end, start, end), side + start + end, 0, 0
+        else:
+            # TensorFlow pads one more at the end than at the start. Taps of zero at the start of the
+            # kernel give the same with equal padding, and spare a copy of the whole input.
+            weight = F.pad(weight, (end - start, 0, end - start, 0))
+        weight = weight.contiguous(memory_format=torch.channels_last)
         self.side = (side + 2 * end - weight.shape[-1]) // convolution.stride[0] + 1
         self._bias, self._clamp, self._fused = bias.detach(), clamp, fused
         self._how = ([end, end], list(convolution.stride), [1, 1], convolution.groups)
         if fused:
-            shape = [_USUAL_BATCH, convolution.in_channels, side, side]
+            batch = BATCH if side <= _SMALL_SIDE else 1
+            shape = [batch, convolution.in_channels, side, side]
             weight = torch._C._nn.mkldnn_reorder_conv2d_weight(weight.to_mkldnn(), *self._how, shape)
         self._weight = weight
 
     def __call__(self, x: torch.Tensor, skip: torch.Tensor | None = None) -> torch.Tensor:
         """The output; with ``skip`` it is added to that tensor, in place."""
+        x = F.pad(x, self._pad) if any(self._pad) else x
         if not self._fused:
             y = F.conv2d(x, self._weight, self._bias, self._how[1], self._how[0], 1, self._how[3])
             y = F.hardtanh_(y, 0.0, 6.0) if self._clamp else y
