@@ -72,18 +72,22 @@ def measure(quick: bool, *, seconds: tuple[int, ...] | None = None) -> list[Resu
 
 
 def poses(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Robots as random rollouts show them: standing, flying, fallen.
+    """Robots as random rollouts from random heights and angles show them: flying, standing, fallen.
 
     Returns:
         Positions and velocities, (count, 6) each.
     """
-    env = gymnasium.make("Hopper-v5", terminate_when_unhealthy=False, max_episode_steps=100)
+    env = gymnasium.make("Hopper-v5", terminate_when_unhealthy=False, max_episode_steps=150)
     robot: Any = env.unwrapped
+    rng = np.random.default_rng(0)
     states = []
-    for episode in range(-(-count // 50)):
+    for episode in range(5):
         env.reset(seed=episode)
         env.action_space.seed(episode)
-        for _ in range(100):
+        qpos = robot.data.qpos.copy()
+        qpos[1:3] += rng.uniform(0, 1), rng.uniform(-np.pi, np.pi) if episode else 0.0
+        robot.set_state(qpos, robot.data.qvel)
+        for _ in range(150):
             env.step(env.action_space.sample())
             states.append((robot.data.qpos.copy(), robot.data.qvel.copy()))
     env.close()
