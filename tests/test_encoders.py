@@ -1,6 +1,7 @@
 """Encoders on real weights where they ship, on files of the real layout where they do not."""
 
 import logging
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,10 +15,14 @@ from trainer.encoders import (
     check_weights,
     demo_features,
     make_encoder,
+    published_lite0,
     vgg16_layers,
 )
 from trainer.errors import UserError
+from trainer.folded import Folded, has_fused
 from trainer.video import write_webm
+
+needs_fused = pytest.mark.skipif(not has_fused(), reason="this PyTorch comes without oneDNN")
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +67,48 @@ def test_features_are_what_the_network_classifies_by(efficientnet):
     # Input 127 must reach the network as 0, and the pooled map must be what its classifier takes.
     grey = np.full((1, 224, 224, 3), 127, np.uint8)
     features = torch.from_numpy(efficientnet.encode(grey))
-    network = efficientnet._network
+    network = published_lite0()
     with torch.inference_mode():
         direct = network(torch.zeros(1, 3, 224, 224))
     assert torch.allclose(network._fc(features), direct, atol=1e-3)
 
 
-def test_efficientnet_prints_nothing(capfd):
-    EfficientNetLite0()
+@pytest.mark.parametrize("fused", [False, pytest.param(True, marks=needs_fused)])
+def test_folding_changes_nothing(fused):
+    pixels = torch.randn((3, 3, 224, 224), generator=torch.Generator().manual_seed(0))
+    network = published_lite0()
+    with torch.inference_mode():
+        wanted = network.extract_features(pixels)
+        maps = Folded(network, fused=fused)(pixels)
+    assert maps.shape == wanted.shape
+    assert (maps - wanted).norm() < 1e-5 * wanted.norm()
+
+
+def test_encoding_leaves_the_threads_of_torch_alone(efficientnet, frames):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        efficientnet.encode(frames)
+        with ThreadPoolExecutor(1) as pool:
+            assert torch.get_num_threads() == pool.submit(torch.get_num_threads).result() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_frames_may_come_one_by_one_and_a_failure_between_them_is_told(efficientnet, frames):
+    wanted = efficientnet.encode(frames)
+    assert np.array_equal(efficientnet.encode(frame for frame in frames), wanted)
+
+    def broken():
+        yield from frames[:5]
+        raise UserError("the disk is gone")
+
+    with pytest.raises(UserError, match="the disk is gone"):
+        efficientnet.encode(broken())
+
+
+def test_efficientnet_prints_nothing(capfd, frames):
+    EfficientNetLite0().encode(frames[:1])
     assert capfd.readouterr() == ("", "")
 
 
@@ -225,7 +264,7 @@ class Counting:
 
     def encode(self, frames):
         self.calls += 1
-        return frames.mean((1, 2), dtype=np.float32)
+        return np.array([frame.mean((0, 1), dtype=np.float32) for frame in frames])
 
 
 def test_features_are_computed_once_and_kept(demo, tmp_path):

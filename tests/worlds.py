@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -25,7 +26,7 @@ class Thumbnail:
     name = "thumbnail"
     dims = 64
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
         grey = [cv2.cvtColor(f, cv2.COLOR_RGB2GRAY) for f in frames]
         return np.array(
             [cv2.resize(g, (8, 8), interpolation=cv2.INTER_AREA).ravel() for g in grey], np.float32

@@ -212,7 +212,7 @@ def find_demo(name: str, demos_dir: Path) -> Demo:
 
 
 def read_frames(demo: Demo) -> np.ndarray:
-    """Decodes the demo's frames.
+    """Decodes the demo's frames, all at once.
 
     Returns:
         Frames, (n, H, W, 3), uint8 RGB.
@@ -220,17 +220,38 @@ def read_frames(demo: Demo) -> np.ndarray:
     Raises:
         UserError: If the stored file is missing or damaged.
     """
+    frames = np.empty((0, 0, 0, 3), np.uint8)
+    for i, frame in enumerate(stream_frames(demo)):
+        if i == 0:
+            frames = np.empty((demo.frames, *frame.shape), np.uint8)
+        frames[i] = frame
+    return frames
+
+
+def stream_frames(demo: Demo) -> Iterator[np.ndarray]:
+    """Decodes the demo's frames one by one: a long demo takes no more memory than a short one.
+
+    Yields:
+        As many frames as the demo has, (H, W, 3), uint8 RGB.
+
+    Raises:
+        UserError: If the stored file is missing or damaged; frames may have come before.
+    """
+    count = 0
     try:
         with VideoReader(demo.path) as reader:
-            frames = [frame for _, frame in reader.frames() if frame is not None]
+            for _, frame in reader.frames():
+                count += 1
+                if frame is None or count > demo.frames:
+                    break
+                yield frame
     except UserError:  # its advice is for videos on their way in
-        frames = []
-    if len(frames) != demo.frames:
+        pass
+    if count != demo.frames:
         raise UserError(
-            f"the stored video {demo.path} is missing or damaged: {len(frames)} of {demo.frames} frames "
+            f"the stored video {demo.path} is missing or damaged: {count} of {demo.frames} frames "
             "can be read; delete its directory and add the demo again"
         )
-    return np.stack(frames)
 
 
 def show(demo: Demo) -> str:

