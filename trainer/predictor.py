@@ -114,9 +114,11 @@ def visual_inputs(features: np.ndarray, dims: int) -> np.ndarray:
     centred = features.astype(np.float64) - features.mean(axis=0)
     if dims == 0:
         return (centred / (centred.std(axis=0) + 1e-6)).astype(np.float32)
-    left, singular, _ = np.linalg.svd(centred, full_matrices=False)
-    components = left[:, :dims] * singular[:dims]
-    # svd leaves the sign open: fix it, so that two machines agree on what a snapshot's inputs mean.
+    # By the frames' inner products: a demo has fewer frames than a frame has features.
+    squares, vectors = np.linalg.eigh(centred @ centred.T)
+    order = np.argsort(squares)[::-1][: min(dims, features.shape[1])]
+    components = vectors[:, order] * np.sqrt(np.maximum(squares[order], 0.0))
+    # The sign of an eigenvector is open: fix it, so that two machines agree on what a snapshot's inputs mean.
     components *= np.where(
         components[np.abs(components).argmax(axis=0), np.arange(components.shape[1])] < 0, -1, 1
     )
