@@ -426,9 +426,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._limit[lanes] = self.horizon
 
 
-def _make_physics(
-    kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int
-) -> Physics:
+def _make_physics(kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> Physics:
     if kind == "mujoco":
         return RolloutPhysics(model, frame_skip, num_envs, nthread)
     if kind == "warp":

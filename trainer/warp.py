@@ -20,9 +20,7 @@ except ImportError as error:
 wp.config.log_level = wp.LOG_WARNING
 
 _LOST = int(
-    mujoco_warp.OverflowType.BROADPHASE
-    | mujoco_warp.OverflowType.NARROWPHASE
-    | mujoco_warp.OverflowType.NEFC
+    mujoco_warp.OverflowType.BROADPHASE | mujoco_warp.OverflowType.NARROWPHASE | mujoco_warp.OverflowType.NEFC
 )
 """Flags of a lane whose contacts did not find room: its physics is wrong from there on."""
 
