@@ -3,7 +3,13 @@
 It never imports ``app``, the web application on top of it.
 """
 
+import os
+
 from trainer.gl import choose_backend
+
+# NumPy's matrix products here are small: threads of its own would only fight with the physics'.
+# Read once, at NumPy's first import.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # MuJoCo reads its choice of GL library once, at its first import, wherever in the package that is.
 choose_backend()

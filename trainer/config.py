@@ -56,9 +56,9 @@ class RolloutConfig:
     total_steps: int = 10_000_000
     """Control steps, all lanes together, after which the run is done."""
     threads: int = 2
-    """Threads of the physics and of the networks. One thread gives the same numbers on any machine."""
+    """Threads of the physics and of the learning. Any number gives the same numbers."""
     physics: str = "mujoco"
-    """Where the robot is simulated: "mujoco", on the processor, or "warp", on an NVIDIA GPU (extra ``warp``)."""
+    """Where the robot is simulated: "mujoco", the processor, or "warp", an NVIDIA GPU (extra ``warp``)."""
 
     def __post_init__(self) -> None:
         _at_least(self, "rollouts", lanes=1, steps=1, total_steps=1, threads=1)

@@ -26,6 +26,7 @@ from trainer.errors import UserError
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -126,6 +127,22 @@ def make(
     )
 
 
+def physics_model(env_spec: EnvSpec) -> mujoco.MjModel:
+    """The robot's model as it is stepped.
+
+    One robot is one island of constraints: looking for islands is switched off, which changes no bit
+    of what comes out and saves a twelfth of the time.
+
+    Args:
+        env_spec: The environment.
+    """
+    model = mujoco.MjModel.from_xml_path(str(env_spec.xml))
+    flag = getattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND", None)  # MuJoCo before 4 does not look by itself
+    if flag is not None:
+        model.opt.disableflags |= flag.value
+    return model
+
+
 def observe(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """The observation of states: everything but x, velocities clipped.
 
@@ -156,7 +173,7 @@ def healthy(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray
     low_angle, high_angle = env_spec.healthy_angle
     z, angle = qpos[..., 1], qpos[..., 2]
     limit = env_spec.healthy_state
-    inside = (np.abs(qpos[..., 2:]) < limit).all(-1) & (np.abs(qvel) < limit).all(-1)
+    inside = np.maximum(np.abs(qpos[..., 2:]).max(-1), np.abs(qvel).max(-1)) < limit
     return inside & (low_z < z) & (z < high_z) & (low_angle < angle) & (angle < high_angle)
 
 
@@ -191,7 +208,8 @@ class RolloutPhysics:
     """
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> None:
-        self._model = model
+        self._models = [model] * num_envs
+        self._frame_skip = frame_skip
         self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]
         self._pool = rollout.Rollout(nthread=nthread)
         self._substeps = np.empty((num_envs, frame_skip, mujoco.mj_stateSize(model, _FULL)))
@@ -200,7 +218,11 @@ class RolloutPhysics:
     def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """See ``Physics.step``."""
         self._control[:] = actions[:, None]
-        self._pool.rollout(self._model, self._data, states, self._control, state=self._substeps)
+        # Unchecked: shapes are right by construction, and the checks cost as much as the rest of a step.
+        self._pool.rollout(
+            self._models, self._data, states, self._control, control_spec=_CONTROL,
+            skip_checks=True, nstep=self._frame_skip, state=self._substeps,
+        )  # fmt: skip
         return self._substeps[:, -1].copy()
 
     def close(self) -> None:
@@ -257,7 +279,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_fps": round(1 / self.dt),
         }
-        self.model = mujoco.MjModel.from_xml_path(str(self.env_spec.xml))
+        self.model = physics_model(self.env_spec)
         self._physics = _make_physics(physics, self.model, self.env_spec.frame_skip, num_envs, nthread)
         self._initial = np.empty(mujoco.mj_stateSize(self.model, _FULL))
         mujoco.mj_getState(self.model, mujoco.MjData(self.model), self._initial, _FULL)
@@ -341,7 +363,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         actions = np.asarray(actions, np.float64)
         if actions.shape != (self.num_envs, self.env_spec.action_size):
             raise ValueError(f"actions must be {self.action_space.shape}, got {actions.shape}")
-        x_before = self._state[:, 1].copy()
+        x_before = self._state[:, 1]
         self._state = self._physics.step(self._state, actions)
         self.elapsed += 1
         qpos, qvel = self._state[:, self._positions], self._state[:, self._velocities]

@@ -56,7 +56,7 @@ class Learner:
             horizon=self.demo_steps,
             seed=config.seed,
         )
-        self._trpo = Trpo(self._policy, config.trpo, seed=config.seed)
+        self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
         self._collector = self._make_collector(config.rollouts.lanes, seed=config.seed, stagger=True)
 
     def look_at(self, features: np.ndarray) -> None:

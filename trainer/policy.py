@@ -55,9 +55,6 @@ def policy_inputs(
 ) -> np.ndarray:
     """Features of a state and a demo time, not normalised.
 
-    The torso angle is unbounded (it counts turns), so every kind but "raw" shows it as sine and
-    cosine: the second flip then looks like the first.
-
     Args:
         obs: Observations, (..., o); index 1 is the torso angle in radians.
         clock: Demo step of each, (...), 0 to horizon; later counts as horizon.
@@ -66,27 +63,55 @@ def policy_inputs(
         table: For "table": what to show at each demo step, (H, k).
 
     Returns:
-        Features, (..., f), float64.
+        Features, (..., f), float64: those of the state, then those of the time.
 
     Raises:
         ValueError: If the kind is unknown, or is "table" without one.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
+    state, time = state_features(obs, kind), time_features(horizon, kind, table)
+    if time is None:
+        return state
+    return np.concatenate([state, time[_rows(clock, time)]], axis=-1)
+
+
+def state_features(obs: np.ndarray, kind: str) -> np.ndarray:
+    """Features of a state alone.
+
+    The torso angle is unbounded (it counts turns), so every kind but "raw" shows it as sine and
+    cosine: the second flip then looks like the first.
+
+    Args:
+        obs: Observations, (..., o).
+        kind: One of ``KINDS``.
+
+    Returns:
+        (..., o) for "raw", else (..., o + 1), float64.
+    """
     if kind == "raw":
         return np.asarray(obs, np.float64)
     angle = obs[..., 1:2]
-    features = [obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]]
-    clock = np.asarray(clock)
+    return np.concatenate([obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]], axis=-1)
+
+
+def time_features(horizon: int, kind: str, table: np.ndarray | None = None) -> np.ndarray | None:
+    """Features of every demo step, one row each; None for kinds without time.
+
+    Raises:
+        ValueError: If the kind is "table" and there is none.
+    """
     if kind == "clock":
-        u = np.minimum(clock, horizon)[..., None] / horizon
+        u = np.arange(horizon + 1)[:, None] / horizon
         phase = 2 * np.pi * u * np.asarray(HARMONICS)
-        features += [2 * u - 1, np.sin(phase), np.cos(phase)]
-    elif kind == "table":
-        if table is None:
-            raise ValueError('kind "table" needs a table (horizon, k)')
-        features.append(table[np.clip(clock, 0, len(table) - 1)])
-    return np.concatenate(features, axis=-1)
+        return np.concatenate([2 * u - 1, np.sin(phase), np.cos(phase)], axis=1)
+    if kind == "table" and table is None:
+        raise ValueError('kind "table" needs a table (horizon, k)')
+    return table if kind == "table" else None
+
+
+def _rows(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
+    return np.clip(clock, 0, len(time) - 1)
 
 
 def feature_size(obs_size: int, kind: str, table_width: int = 0) -> int:
@@ -111,13 +136,17 @@ class PolicySnapshot:
     """Of the features, (f,), float64."""
     std: np.ndarray
     """Of the features, (f,), float64."""
-    table: np.ndarray | None = None
-    """(H, k) for kind "table"."""
+    time: np.ndarray | None
+    """Normalised inputs of each demo step, float32: they depend on nothing else. None without time."""
 
     def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
-        """Normalised policy inputs of observations (..., o) at demo steps (...): float32."""
-        features = policy_inputs(obs, clock, self.horizon, self.kind, self.table)
-        return np.clip((features - self.mean) / self.std, -_CLIP, _CLIP).astype(np.float32)
+        """Normalised policy inputs of observations (..., o) at demo steps (...): (..., f), float32."""
+        features = state_features(obs, self.kind)
+        width = features.shape[-1]
+        state = _normalise(features, self.mean[:width], self.std[:width])
+        if self.time is None:
+            return state
+        return np.concatenate([state, self.time[_rows(clock, self.time)]], axis=-1)
 
     def act(self, inputs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Actions for normalised inputs.
@@ -137,6 +166,10 @@ class PolicySnapshot:
             noise = rng.standard_normal(actions.shape, np.float32)
             actions = actions + np.exp(self.log_std) * noise
         return actions
+
+
+def _normalise(features: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    return np.clip((features - mean) / std, -_CLIP, _CLIP).astype(np.float32)
 
 
 class Normaliser(nn.Module):
@@ -206,7 +239,11 @@ class Policy(nn.Module):
 
     def log_prob(self, inputs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Log density of actions (B, a) at inputs (B, f), in nats: (B,)."""
-        z = (actions - self(inputs)) * torch.exp(-self.log_std)
+        return self.log_prob_of(self(inputs), actions)
+
+    def log_prob_of(self, mean: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Log density of actions (B, a) around mean actions (B, a), in nats: (B,)."""
+        z = (actions - mean) * torch.exp(-self.log_std)
         return (-0.5 * z**2 - self.log_std - 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def observe(self, obs: np.ndarray, clock: np.ndarray) -> None:
@@ -217,15 +254,20 @@ class Policy(nn.Module):
     def snapshot(self) -> PolicySnapshot:
         """The policy as it is now, in copies."""
         layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
+        mean, std = self.normaliser.mean.numpy().copy(), np.sqrt(self.normaliser.var.numpy() + 1e-8)
+        time = time_features(self.horizon, self.config.kind, self.table)
+        if time is not None:
+            width = time.shape[1]
+            time = _normalise(time, mean[-width:], std[-width:])
         return PolicySnapshot(
             kind=self.config.kind,
             horizon=self.horizon,
             weights=tuple(layer.weight.detach().numpy().T.copy() for layer in layers),
             biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
             log_std=self.log_std.detach().numpy().copy(),
-            mean=self.normaliser.mean.numpy().copy(),
-            std=np.sqrt(self.normaliser.var.numpy() + 1e-8),
-            table=self.table,
+            mean=mean,
+            std=std,
+            time=time,
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -145,29 +145,51 @@ class Collector:
         Returns:
             What happened, lane-first.
         """
-        lanes, size = self.env.num_envs, self.env.env_spec
-        nq, nv = self.env.model.nq, self.env.model.nv
-        batch = {
-            "obs": np.empty((lanes, steps, size.obs_size)),
-            "actions": np.empty((lanes, steps, size.action_size), np.float32),
-            "qpos": np.empty((lanes, steps, nq)),
-            "qvel": np.empty((lanes, steps, nv)),
-            "clock": np.empty((lanes, steps), np.int32),
-            "inputs": np.empty((lanes, steps, len(policy.mean)), np.float32),
-            "env_rewards": np.empty((lanes, steps)),
-            "terminated": np.empty((lanes, steps), bool),
-            "truncated": np.empty((lanes, steps), bool),
-            "next_obs": np.empty((lanes, steps, size.obs_size)),
-            "next_qpos": np.empty((lanes, steps, nq)),
-            "next_qvel": np.empty((lanes, steps, nv)),
-            "next_clock": np.empty((lanes, steps), np.int32),
+        env, size = self.env, self.env.env_spec
+        rng = None if deterministic else self._rng
+
+        def room(rows: int, *width: int, dtype: Any = np.float64) -> np.ndarray:
+            # Time first, so that a step writes one piece of memory; turned lane first at the end.
+            return np.empty((rows, env.num_envs, *width), dtype)
+
+        states = {
+            "obs": room(steps + 1, size.obs_size),
+            "qpos": room(steps + 1, env.model.nq),
+            "qvel": room(steps + 1, env.model.nv),
+            "clock": room(steps + 1, dtype=np.int32),
+            "inputs": room(steps + 1, len(policy.mean), dtype=np.float32),
         }
-        for t in range(steps):
-            row = self._step(policy, None if deterministic else self._rng)
-            for name, value in row.items():
-                batch[name][:, t] = value
-        next_inputs = policy.inputs(batch["next_obs"], batch["next_clock"])
-        return Transitions(next_inputs=next_inputs, **batch)
+        deeds = {
+            "actions": room(steps, size.action_size, dtype=np.float32),
+            "env_rewards": room(steps),
+            "terminated": room(steps, dtype=bool),
+            "truncated": room(steps, dtype=bool),
+        }
+        lasts: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = []
+        for t in range(steps + 1):
+            now = {"obs": self._obs, "qpos": env.qpos, "qvel": env.qvel, "clock": self._clock}
+            now["inputs"] = policy.inputs(self._obs, self._clock)
+            for name, value in now.items():
+                states[name][t] = value
+            if t == steps:
+                break
+            outcome, last = self._step(policy.act(now["inputs"], rng))
+            for name, value in outcome.items():
+                deeds[name][t] = value
+            if last is not None:
+                lasts.append((t, *last))
+        after = {name: rows[1:] for name, rows in states.items()}
+        if lasts:  # where an episode ended, what came after the step is not what the next one started from
+            steps_K = np.concatenate([np.full(len(lanes), t) for t, lanes, _ in lasts])
+            lanes_K = np.concatenate([lanes for _, lanes, _ in lasts])
+            ends = {name: np.concatenate([end[name] for *_, end in lasts]) for name in lasts[0][2]}
+            ends["inputs"] = policy.inputs(ends["obs"], ends["clock"])
+            after = {name: rows.copy() for name, rows in after.items()}
+            for name, rows in after.items():
+                rows[steps_K, lanes_K] = ends[name]
+        columns = {name: rows[:-1] for name, rows in states.items()} | deeds
+        columns |= {f"next_{name}": rows for name, rows in after.items()}
+        return Transitions(**{name: rows.swapaxes(0, 1) for name, rows in columns.items()})
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed training needs, as tensors and plain numbers."""
@@ -193,15 +215,15 @@ class Collector:
         self._rng.bit_generator.state = state["rng"]
         self._obs = self.env.obs
 
-    def _step(self, policy: PolicySnapshot, rng: np.random.Generator | None) -> dict[str, np.ndarray]:
-        env, obs, clock = self.env, self._obs, self._clock
-        qpos, qvel = env.qpos, env.qvel
-        inputs = policy.inputs(obs, clock)
-        actions = policy.act(inputs, rng)
+    def _step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, dict[str, np.ndarray]] | None]:
+        """One control step: what it brought, and the last states of the lanes that ended, if any did."""
+        env, clock = self.env, self._clock
         elapsed = env.elapsed + 1
-        self._obs, env_rewards, terminated, truncated, infos = env.step(actions)
+        before, (self._obs, env_rewards, terminated, truncated, infos) = self._obs, env.step(actions)
         step = Step(
-            obs=obs,
+            obs=before,
             actions=actions,
             clock=clock,
             elapsed=elapsed,
@@ -215,26 +237,19 @@ class Collector:
         truncated = (truncated | (next_clock >= env.horizon)) & ~terminated
         ended = terminated | truncated
         self._clock = np.where(ended, 0, next_clock).astype(np.int32)
+        last = None
         if ended.any():
+            lanes = np.flatnonzero(ended)
+            ends = {"obs": step.next_obs, "qpos": step.next_qpos, "qvel": step.next_qvel, "clock": next_clock}
+            last = lanes, {name: value[lanes] for name, value in ends.items()}
             late = ended & ~already  # ended by the rules, not by the environment
             if late.any():
                 env.reset(options={"reset_mask": late})
-            self._begin(np.flatnonzero(ended))
-        return {
-            "obs": obs,
-            "actions": actions,
-            "qpos": qpos,
-            "qvel": qvel,
-            "clock": clock,
-            "inputs": inputs,
-            "env_rewards": env_rewards,
-            "terminated": terminated,
-            "truncated": truncated,
-            "next_obs": step.next_obs,
-            "next_qpos": step.next_qpos,
-            "next_qvel": step.next_qvel,
-            "next_clock": next_clock,
-        }
+            self._begin(lanes)
+        outcome = {
+            "actions": actions, "env_rewards": env_rewards, "terminated": terminated, "truncated": truncated,
+        }  # fmt: skip
+        return outcome, last
 
     def _begin(self, lanes: np.ndarray) -> None:
         starts = self.rules.start(lanes, self._rng)

@@ -12,12 +12,15 @@ Shapes: N lanes, T steps, B = N T samples, f inputs, a actions, P policy paramet
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 from trainer.policy import Policy, ValueFunction
@@ -104,14 +107,18 @@ class Trpo:
         policy: Improved in place by ``update``.
         config: The step.
         seed: Of the value function's weights and of the subsamples.
+        threads: With 2 or more, the value regression runs beside the policy's step. The numbers are
+            the same: neither looks at what the other does.
     """
 
-    def __init__(self, policy: Policy, config: TrpoConfig, *, seed: int) -> None:
+    def __init__(self, policy: Policy, config: TrpoConfig, *, seed: int, threads: int = 1) -> None:
         self.policy = policy
         self.config = config
         self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed)
         self._parameters = [*policy.mean.parameters(), policy.log_std]
-        self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        # Fused: one pass over the parameters; they are few, and the calls would cost more than the sums.
+        self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate, fused=True)
+        self._beside = ThreadPoolExecutor(1, "value", _one_thread) if threads > 1 else None
         self._generator = torch.Generator().manual_seed(seed)
 
     def update(self, rollouts: Rollouts, rewards_NT: np.ndarray) -> TrpoStats:
@@ -131,15 +138,14 @@ class Trpo:
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
         inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1)
         actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1)
-        with torch.no_grad():
-            values_NT = self.value(torch.from_numpy(rollouts.inputs)).numpy()
-            next_values_NT = self.value(torch.from_numpy(rollouts.next_inputs)).numpy()
+        ended_NT = rollouts.terminated | rollouts.truncated
+        values_NT, next_values_NT = self._values(rollouts, ended_NT)
         advantages_NT = gae(
             rewards_NT,
             values_NT,
             next_values_NT,
             rollouts.terminated,
-            rollouts.terminated | rollouts.truncated,
+            ended_NT,
             gamma=self.config.gamma,
             lam=self.config.lam,
         )
@@ -147,9 +153,14 @@ class Trpo:
         spread = advantages_NT.std() + 1e-8
         standard_NT = (advantages_NT - advantages_NT.mean()) / spread
         advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten()
-        accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B)
         returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten()
-        value_loss = self._fit_value(inputs_Bf, returns_B)
+        # All that is random is drawn here, in one order, whichever of the two below runs first.
+        sample = self._permutation(len(inputs_Bf))[: self.config.fisher_samples]
+        orders = [self._permutation(len(inputs_Bf)) for _ in range(self.config.value_epochs)]
+        regression = partial(self._fit_value, inputs_Bf, returns_B, orders)
+        beside = self._beside.submit(regression) if self._beside is not None else None
+        accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B, sample)
+        value_loss = regression() if beside is None else beside.result()
         self.policy.observe(rollouts.obs, rollouts.clock)
         log_std = self.policy.log_std.detach()
         return TrpoStats(
@@ -178,47 +189,65 @@ class Trpo:
         self._adam.load_state_dict(state["adam"])
         self._generator.set_state(state["generator"])
 
+    def _permutation(self, count: int) -> torch.Tensor:
+        return torch.randperm(count, generator=self._generator)
+
+    def _values(self, rollouts: Rollouts, ended_NT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """V before and after each step: one pass, as the state after a step is the next one's."""
+        with torch.no_grad():
+            whole = np.concatenate([rollouts.inputs, rollouts.next_inputs[:, -1:]], axis=1)
+            values_NT1 = self.value(torch.from_numpy(whole)).numpy()
+            next_values_NT = values_NT1[:, 1:].copy()
+            if ended_NT.any():
+                last = self.value(torch.from_numpy(rollouts.next_inputs[ended_NT]))
+                next_values_NT[ended_NT] = last.numpy()
+        return values_NT1[:, :-1], next_values_NT
+
     def _improve(
-        self, inputs_Bf: torch.Tensor, actions_Ba: torch.Tensor, advantages_B: torch.Tensor
+        self,
+        inputs_Bf: torch.Tensor,
+        actions_Ba: torch.Tensor,
+        advantages_B: torch.Tensor,
+        sample: torch.Tensor,
     ) -> tuple[bool, int, float, float]:
         config, policy = self.config, self.policy
-        with torch.no_grad():
-            old_mean_Ba, old_log_std = policy(inputs_Bf), policy.log_std.clone()
-            old_log_prob_B = policy.log_prob(inputs_Bf, actions_Ba)
+        mean_Ba = policy(inputs_Bf)
+        log_prob_B = policy.log_prob_of(mean_Ba, actions_Ba)
+        old_mean_Ba, old_log_std = mean_Ba.detach(), policy.log_std.detach().clone()
+        old_log_prob_B = log_prob_B.detach()
 
-        def objective() -> torch.Tensor:
-            ratio_B = torch.exp(policy.log_prob(inputs_Bf, actions_Ba) - old_log_prob_B)
+        def objective(log_prob_B: torch.Tensor) -> torch.Tensor:
+            ratio_B = torch.exp(log_prob_B - old_log_prob_B)
             return (ratio_B * advantages_B).mean() + config.entropy_bonus * policy.log_std.sum()
 
-        def divergence() -> torch.Tensor:
-            return mean_kl(old_mean_Ba, old_log_std, policy(inputs_Bf), policy.log_std)
-
-        before = objective()
+        before = objective(log_prob_B)
         gradient_P = _flat(torch.autograd.grad(before, self._parameters))
-        sample = torch.randperm(len(inputs_Bf), generator=self._generator)
-        sample = sample[: config.fisher_samples]
-        fisher = fisher_product(policy, inputs_Bf[sample], config.damping)
-        direction_P = conjugate_gradient(fisher, gradient_P, config.cg_iterations)
-        curvature = direction_P @ fisher(direction_P)
-        if not torch.isfinite(curvature) or curvature <= 0:  # no gradient: nothing to improve
-            return False, 0, 0.0, 0.0
-        step_P = direction_P * torch.sqrt(2 * config.max_kl / curvature)
-        old_P = parameters_to_vector(self._parameters).detach().clone()
         with torch.no_grad():
+            fisher = fisher_product(policy, inputs_Bf[sample], config.damping)
+            direction_P = conjugate_gradient(fisher, gradient_P, config.cg_iterations)
+            curvature = direction_P @ fisher(direction_P)
+            if not torch.isfinite(curvature) or curvature <= 0:  # no gradient: nothing to improve
+                return False, 0, 0.0, 0.0
+            step_P = direction_P * torch.sqrt(2 * config.max_kl / curvature)
+            old_P = parameters_to_vector(self._parameters).clone()
             for tries in range(config.backtracks):
                 step = config.backtrack_factor**tries * step_P
                 vector_to_parameters(old_P + step, self._parameters)
-                gain, kl = float(objective() - before), float(divergence())
+                mean_Ba = policy(inputs_Bf)
+                gain = float(objective(policy.log_prob_of(mean_Ba, actions_Ba)) - before)
+                kl = float(mean_kl(old_mean_Ba, old_log_std, mean_Ba, policy.log_std))
                 if gain > 0 and kl <= config.max_kl:
                     return True, tries, kl, gain
             vector_to_parameters(old_P, self._parameters)
         return False, config.backtracks, 0.0, 0.0
 
-    def _fit_value(self, inputs_Bf: torch.Tensor, returns_B: torch.Tensor) -> float:
+    def _fit_value(
+        self, inputs_Bf: torch.Tensor, returns_B: torch.Tensor, orders: Sequence[torch.Tensor]
+    ) -> float:
+        """Minibatch regression on the returns, one pass for each order of the samples."""
         targets_B = self.value.rescale(returns_B)
-        losses: list[float] = []
-        for _ in range(self.config.value_epochs):
-            order = torch.randperm(len(targets_B), generator=self._generator)
+        losses: list[torch.Tensor] = []
+        for order in orders:
             losses = []
             for index in order.split(self.config.value_batch):
                 error = self.value.normalised(inputs_Bf[index]) - targets_B[index]
@@ -226,8 +255,8 @@ class Trpo:
                 self._adam.zero_grad()
                 loss.backward()
                 self._adam.step()
-                losses.append(loss.item())
-        return float(np.mean(losses)) if losses else float("nan")
+                losses.append(loss.detach())
+        return float(torch.stack(losses).mean()) if losses else float("nan")
 
 
 def gae(
@@ -329,24 +358,50 @@ def fisher_product(
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """The function v -> (F + damping I) v, F the mean Fisher matrix of the policy at the inputs.
 
-    F is the Hessian of KL(policy now || policy) at the policy now, so the product is the gradient
-    of (gradient of the KL) . v (Schulman et al. 2015, appendix C).
+    F is the Hessian of KL(policy now || policy) at the policy now (Schulman et al. 2015, appendix C).
+    For a Gaussian that is F = mean of J^T S^-1 J for the network of the mean, J its Jacobian and S the
+    covariance, and 2 I for the log deviations. The product runs forwards (J v) and backwards (J^T u)
+    through the tanh network, with its activations worked out once: half the arithmetic of
+    differentiating the KL twice.
 
     Args:
         policy: Not changed; its parameters at the time of the call count.
         inputs_Bf: Normalised inputs, (B, f).
         damping: Added to the diagonal.
     """
-    parameters = [*policy.mean.parameters(), policy.log_std]
-    mean_Ba, log_std = policy(inputs_Bf), policy.log_std
-    kl = mean_kl(mean_Ba.detach(), log_std.detach(), mean_Ba, log_std)
-    slope_P = _flat(torch.autograd.grad(kl, parameters, create_graph=True))
+    layers = [layer for layer in policy.mean if isinstance(layer, nn.Linear)]
+    weights = [layer.weight.detach().clone() for layer in layers]
+    shapes = [shape for layer in layers for shape in (layer.weight.shape, layer.bias.shape)]
+    sizes = [shape.numel() for shape in shapes]
+    precision_a = torch.exp(-2 * policy.log_std.detach()) / len(inputs_Bf)
+    activations, slopes = [inputs_Bf], []
+    for layer in layers[:-1]:
+        activations.append(torch.tanh(layer(activations[-1])).detach())
+        slopes.append(1 - activations[-1].square())
 
     def product(v_P: torch.Tensor) -> torch.Tensor:
-        grads = torch.autograd.grad(slope_P @ v_P, parameters, retain_graph=True)
-        return _flat(grads).detach() + damping * v_P
+        parts = v_P.split([*sizes, len(precision_a)])
+        steps = [part.view(shape) for part, shape in zip(parts[:-1], shapes, strict=True)]
+        tangent = torch.addmm(steps[1], activations[0], steps[0].T)
+        for i in range(1, len(layers)):
+            tangent.mul_(slopes[i - 1])
+            tangent = torch.addmm(steps[2 * i + 1], tangent, weights[i].T).addmm_(
+                activations[i], steps[2 * i].T
+            )
+        grads: list[torch.Tensor] = [2 * parts[-1]]
+        back = tangent * precision_a
+        for i in range(len(layers) - 1, -1, -1):
+            grads[:0] = [(back.T @ activations[i]).reshape(-1), back.sum(0)]
+            if i:
+                back = (back @ weights[i]).mul_(slopes[i - 1])
+        return torch.cat(grads).add_(v_P, alpha=damping)
 
     return product
+
+
+def _one_thread() -> None:
+    """For a thread that works beside another: the networks are too small to be split further."""
+    torch.set_num_threads(1)
 
 
 def _flat(tensors: tuple[torch.Tensor, ...]) -> torch.Tensor:

@@ -51,6 +51,8 @@ class HandcodedConfig:
     """Control steps in an episode: 8 s."""
     evaluate_every: int = 10
     """Iterations between evaluations (16 deterministic episodes)."""
+    threads: int = 2
+    """Of the physics and of the learning. Any number gives the same numbers."""
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="raw"))
     """Sees the observation alone: the rewards say nothing about time."""
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
@@ -60,7 +62,7 @@ class HandcodedConfig:
         if self.task not in TASK_REWARDS:
             choices = ", ".join(sorted(TASK_REWARDS))
             raise UserError(f"unknown task {self.task!r}; choose one of: {choices}")
-        for name in ("steps", "lanes", "batch", "horizon", "evaluate_every"):
+        for name in ("steps", "lanes", "batch", "horizon", "evaluate_every", "threads"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -110,11 +112,13 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     Returns:
         Policies, learning curve and the best episode.
     """
+    torch.set_num_threads(1)  # these networks are too small to gain from more
     # Hopping is learned as in Hopper-v5, where a fall ends the episode; a flip is no fall.
     env = envs.make(
         "hopper",
         config.lanes,
         horizon=config.horizon,
+        nthread=config.threads,
         terminate_when_unhealthy=config.task == "hop",
     )
     policy = Policy(
@@ -124,7 +128,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         horizon=config.horizon,
         seed=config.seed,
     )
-    trpo = Trpo(policy, config.trpo, seed=config.seed)
+    trpo = Trpo(policy, config.trpo, seed=config.seed, threads=config.threads)
     collector = Collector(env, seed=config.seed)
     reward = TASK_REWARDS[config.task]
     per_iteration = config.lanes * config.batch
@@ -218,7 +222,6 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--gamma", type=float, default=TrpoConfig().gamma)
     parser.add_argument("--evaluate-every", type=int, default=10, help="iterations")
     args = parser.parse_args(argv)
-    torch.set_num_threads(1)  # these networks are too small to gain from more
     config = HandcodedConfig(
         task=args.task,
         steps=args.steps,
