@@ -4,12 +4,16 @@ Kernels are compiled on the first run (about 20 s) and cached. Tolerances: ``tra
 """
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from trainer import envs
+from trainer.bench.figures import Skipped
+from trainer.config import load_config
 from trainer.errors import UserError
+from trainer.learner import Learner
 from trainer.policy import Policy, PolicyConfig
 from trainer.rollouts import Collector
 from trainer.trpo import Trpo, TrpoConfig
@@ -49,6 +53,14 @@ def states():
     return qpos, qvel
 
 
+@pytest.fixture(scope="module")
+def ours():
+    """One for several tests: what a lane did before must not matter."""
+    env = make()
+    yield env
+    env.close()
+
+
 def started(env, states):
     env.set_states(np.arange(LANES), *states, elapsed=np.zeros(LANES))
     return env
@@ -60,7 +72,7 @@ def apart(ours, theirs):
 
 
 def own_jump(qpos, qvel, action):
-    """How far the processor's velocities after one step scatter when the state is moved by rounding errors."""
+    """How far the processor's velocities after one step scatter when the state is moved by rounding."""
     model = envs.physics_model(envs.SPECS["hopper"])
     physics = envs.RolloutPhysics(model, 4, 200, 0)
     state = np.tile(np.concatenate([[0], qpos, qvel]), (200, 1))
@@ -70,13 +82,13 @@ def own_jump(qpos, qvel, action):
     return np.abs(after - after[0])[:, 7:].max()
 
 
-def test_each_step_agrees_with_the_processor(states):
+def test_each_step_agrees_with_the_processor(ours, states):
     """Every lane within tolerance, unless a contact sets in or not: the processor's answer jumps too."""
-    ours, theirs = make(), started(envs.make("hopper", LANES, nthread=0), states)
+    theirs = started(envs.make("hopper", LANES, nthread=0), states)
     beyond = 0
     for action in actions_for(3, LANES, 60):
         before = theirs.qpos, theirs.qvel
-        ours.set_states(np.arange(LANES), *before)
+        started(ours, before)
         obs, rewards, *_ = ours.step(action)
         expected, expected_rewards, *_ = theirs.step(action)
         positions, velocities = apart(ours, theirs)
@@ -90,8 +102,9 @@ def test_each_step_agrees_with_the_processor(states):
     assert beyond < 5
 
 
-def test_trajectories_agree_as_long_as_chaos_lets_them(states):
-    ours, theirs = started(make(), states), started(envs.make("hopper", LANES, nthread=0), states)
+def test_trajectories_agree_as_long_as_chaos_lets_them(ours, states):
+    theirs = started(envs.make("hopper", LANES, nthread=0), states)
+    started(ours, states)
     seen = {}
     for step, action in enumerate(actions_for(4, LANES, 100), start=1):
         ours.step(action)
@@ -102,18 +115,17 @@ def test_trajectories_agree_as_long_as_chaos_lets_them(states):
         np.testing.assert_array_less(seen[step], np.multiply(bound, [5e-7, 1e-6, 2e-6, 5e-6]))
 
 
-def test_a_lane_depends_on_its_own_state_alone(states):
+def test_a_lane_depends_on_its_own_state_alone(ours, states):
     """Not on what it did before, nor on its neighbours, nor on how many they are: to the last bit."""
     action = actions_for(5, LANES, 1)[0]
     fresh = started(make(), states)
     fresh.step(action)
-    used = make()
-    used.reset(seed=0)
+    ours.reset(seed=0)
     for other in actions_for(6, LANES, 30):
-        used.step(other)
-    started(used, states).step(action)
-    np.testing.assert_array_equal(used.qpos, fresh.qpos)
-    np.testing.assert_array_equal(used.qvel, fresh.qvel)
+        ours.step(other)
+    started(ours, states).step(action)
+    np.testing.assert_array_equal(ours.qpos, fresh.qpos)
+    np.testing.assert_array_equal(ours.qvel, fresh.qvel)
     few = make(5)
     chosen = np.array([80, 3, 50, 70, 20])
     few.set_states(np.arange(5), states[0][chosen], states[1][chosen])
@@ -170,13 +182,25 @@ def test_learning_works_on_it():
     env.close()
 
 
-def test_contacts_without_room_are_an_error(states, monkeypatch):
+def test_a_run_can_be_set_to_it():
+    """The first steps of the random policy are the processor's, but for rounding."""
+    config = load_config(None, {"rollouts.lanes": 4, "rollouts.threads": 1})
+    on_warp = replace(config, rollouts=replace(config.rollouts, physics="warp"))
+    first, second = (Learner(c, 30, 30.0).random_rollouts().qpos[:, 1:6] for c in (config, on_warp))
+    assert 0 < np.abs(first - second).max() < 1e-5
+
+
+@pytest.mark.parametrize("room", [(1, 41), (14, 12)])
+def test_contacts_without_room_are_an_error(room, monkeypatch):
     from trainer import warp
 
-    monkeypatch.setattr(warp, "_room", lambda model, pairs: (14, 4))
-    env = started(make(), states)
-    with pytest.raises(RuntimeError, match=r"more contacts than .* room for, 14 a lane with 4 constraints"):
-        env.step(np.zeros((LANES, 3)))
+    lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
+    model = envs.physics_model(envs.SPECS["hopper"])
+    states = np.concatenate([np.zeros((4, 1)), lying, np.zeros((4, 6))], axis=1)
+    warp.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
+    monkeypatch.setattr(warp, "_room", lambda model, pairs: room)
+    with pytest.raises(RuntimeError, match=f"room for, {room[0]} a lane with {room[1]} constraints"):
+        warp.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
 
 
 def test_an_unknown_device_names_those_there_are():
@@ -196,3 +220,16 @@ def test_without_the_package_the_error_names_the_extra(monkeypatch):
 def test_an_unknown_physics_is_refused():
     with pytest.raises(ValueError, match="must be 'mujoco' or 'warp', got 'wrap'"):
         envs.make("hopper", 2, physics="wrap")
+
+
+def test_the_bench_counts_steps_of_both():
+    from trainer.bench.warp import growth, measure
+
+    taken = growth((2, 8), device="cpu", turns=1, lane_steps=64)
+    assert set(taken.y) == {"mujoco", "warp"}
+    assert all(len(line) == 2 and min(line) > 10 for line in taken.y.values())
+    import warp
+
+    if not warp.is_cuda_available():
+        (skipped,) = measure(quick=True)
+        assert isinstance(skipped, Skipped) and "no CUDA device" in skipped.reason
