@@ -119,6 +119,16 @@ def _parser() -> argparse.ArgumentParser:
         metavar="PREFIX",
         help="where to write PREFIX.json, .policy.pt and .hidden.npz",
     )
+
+    bench = _command(commands, "bench", None, "measure the program")
+    actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
+    speed = _command(actions, "speed", _bench_speed, "speed, memory and waiting beside peers and limits")
+    speed.add_argument("--quick", action="store_true", help="small and rough: under 2 minutes")
+    speed.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
+    speed.add_argument("--out", type=Path, metavar="DIR", help="write a report with charts there")
+    speed.add_argument(
+        "--part", dest="parts", action="append", metavar="PART", help="only this part; may be repeated"
+    )
     return parser
 
 
@@ -146,6 +156,7 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
         "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE",
         help="one setting, such as trpo.max_kl=0.02; may be repeated",
     )  # fmt: skip
+    parser.add_argument("--device", metavar="NAME", help="of predictor and policy: cpu (default) or cuda")
     parser.add_argument("--encoder", metavar="NAME", help="efficientnet-lite0 (default) or vgg16")
     parser.add_argument("--encoder-weights", type=Path, metavar="FILE", help="instead of fetching them")
 
@@ -154,7 +165,7 @@ def _config(arguments: argparse.Namespace) -> Any:
     from trainer.config import load_config, parse_override
 
     overrides = dict(parse_override(text) for text in arguments.settings)
-    for key in ("seed", "encoder"):
+    for key in ("seed", "device", "encoder"):
         if getattr(arguments, key) is not None:
             overrides[key] = getattr(arguments, key)
     ratings = getattr(arguments, "ratings", None)
@@ -179,7 +190,10 @@ def _serve(arguments: argparse.Namespace) -> None:
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
         config=config,
         explicit=bool(arguments.settings)
-        or any(given is not None for given in (arguments.config, arguments.seed, arguments.encoder)),
+        or any(
+            given is not None
+            for given in (arguments.config, arguments.seed, arguments.device, arguments.encoder)
+        ),
         encoder_weights=arguments.encoder_weights,
         host=arguments.host,
         port=arguments.port,
@@ -318,6 +332,35 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
     save_result(arguments.out, result)
     for key, value in asdict(result.best_score).items():
         print(f"{key:18} {value:g}")
+
+
+def _bench_speed(arguments: argparse.Namespace) -> None:
+    import shlex
+    import time
+
+    from trainer.bench import report, speed
+    from trainer.files import write_atomic
+
+    unknown = set(arguments.parts or ()) - set(speed.PARTS)
+    if unknown:
+        raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(speed.PARTS)}")
+    if arguments.json is not None:
+        _check_output(arguments.json, arguments.json.absolute().parent)
+    if arguments.out is not None and arguments.out.exists() and not arguments.out.is_dir():
+        raise UserError(f"--out {arguments.out} is a file; give the name of a directory")
+    began = time.monotonic()
+    results = speed.measure(
+        quick=arguments.quick,
+        parts=arguments.parts or speed.PARTS,
+        tell=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    command = shlex.join(["onedemo", *sys.argv[1:]])
+    about = report.as_json(results, command=command, seconds=time.monotonic() - began)
+    print(report.table(results))
+    if arguments.json is not None:
+        write_atomic(arguments.json, (json.dumps(about, indent=1) + "\n").encode())
+    if arguments.out is not None:
+        report.write_report(arguments.out, "onedemo: speed", results, about)
 
 
 def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:

@@ -42,27 +42,21 @@ class Data:
         if event == self._counted:
             return
         self._counted = event
-        counts = count_ratings((row[4], row[6], row[5]) for row in store.iter_ratings(run))
-        self._html.content = data_html(run, counts, store.ratings_by_class(run), str(store.path.absolute()))
+        self._html.content = data_html(run, store.tallies(run), str(store.path.absolute()))
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""
 
 
-def count_ratings(rows) -> dict[tuple[str, str], list[int]]:
-    """Ratings of 1 to 5 for each rater and stage.
+def data_html(run: str, counts: dict[tuple[str, str], list[int]], path: str) -> str:
+    """The whole tab.
 
     Args:
-        rows: (rater, stage, value) of each rating.
+        run: Whose ratings.
+        counts: As ``Store.tallies``.
+        path: Of the database.
     """
-    counts: dict[tuple[str, str], list[int]] = {}
-    for rater, stage, value in rows:
-        counts.setdefault((rater, stage), [0] * 5)[value - 1] += 1
-    return dict(sorted(counts.items()))
-
-
-def data_html(run: str, counts: dict[tuple[str, str], list[int]], classes: list[int], path: str) -> str:
-    """The whole tab."""
+    classes = [sum(row[value] for row in counts.values()) for value in range(5)]
     total = sum(classes)
     heads = "".join(
         f'<th scope="col" title="{answer}">{value}</th>' for value, answer in enumerate(ANSWERS, 1)

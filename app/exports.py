@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
+from itertools import islice
 
 from trainer.store import RATING_COLUMNS
 
@@ -30,11 +31,11 @@ def csv_blocks(rows: Iterable[tuple], *, rows_per_block: int = 500) -> Iterator[
     buffer = io.StringIO()
     writer = csv.writer(buffer)
     writer.writerow(RATING_COLUMNS)
-    for count, row in enumerate(rows, start=1):
-        writer.writerow([defuse(cell) for cell in row])
-        if count % rows_per_block == 0:
-            yield _drain(buffer)
-    if buffer.tell():
+    rows = iter(rows)
+    while block := list(islice(rows, rows_per_block)):
+        writer.writerows([[defuse(cell) for cell in row] for row in block])
+        yield _drain(buffer)
+    if buffer.tell():  # no row at all: the header
         yield _drain(buffer)
 
 

@@ -1,6 +1,6 @@
 """Our TRPO against sb3-contrib's, on Hopper-v5 with termination, at equal steps and settings.
 
-Run by hand in an environment that also has the extra "check" (sb3-contrib) and imageio:
+Run by hand in an environment that also has the extra "bench" (sb3-contrib) and imageio:
 ``python tests/check_trpo_sb3.py --steps 200000 --seeds 3``. Both get 16 lanes x 128 steps a
 batch, 2 x 64 tanh networks, normalised observations and the same trust region; both are judged
 by the stock return of the mean action over 16 episodes.

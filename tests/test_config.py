@@ -37,6 +37,7 @@ def test_overrides_beat_the_file(tmp_path):
         ("[predictor]\nlearning_rat = 1", "'predictor.learning_rate'"),
         ("trpo = 3", "trpo is a section, not a value"),
         ("seed = 'x'", "seed must be a whole number, got 'x'"),
+        ("device = 'gpu'", """device must be "cpu", "cuda" or "cuda:N", got 'gpu'"""),
         ("seed = true", "seed must be a whole number, got True"),
         ("[trpo]\nmax_kl = -1", "trpo.max_kl must be > 0 nats, got -1"),
         ("[ratings]\nonline = -1", "ratings.online must be at least 0, got -1"),

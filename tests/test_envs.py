@@ -1,6 +1,7 @@
 """The batched hopper against gymnasium's own, its resets and its saved state."""
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
@@ -180,6 +181,25 @@ def test_bad_input():
         env.step(np.zeros(3))
     with pytest.raises(ValueError, match="staggr"):
         env.reset(options={"staggr": True})
+
+
+def test_stepping_without_the_search_for_islands_changes_no_bit():
+    """A lane that falls and lies, so that several contacts act at once."""
+    ends = []
+    for islands in (False, True):
+        env = envs.make("hopper", 8, nthread=0)
+        flag = mujoco.mjtDisableBit.mjDSBL_ISLAND.value
+        assert env.model.opt.disableflags & flag
+        if islands:
+            env.model.opt.disableflags &= ~flag
+        env.reset(seed=3)
+        actions = np.random.default_rng(3).uniform(-1, 1, (150, 8, 3))
+        for action in actions:
+            env.step(action)
+        ends.append(np.concatenate([env.qpos, env.qvel], axis=1))
+        env.close()
+    np.testing.assert_array_equal(*ends)
+    assert (ends[0][:, 1] < 0.5).any()
 
 
 def test_spec_says_what_the_model_is():

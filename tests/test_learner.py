@@ -45,6 +45,35 @@ def test_a_demo_shorter_than_a_clip_is_refused():
         Learner(small_config(), 8, 30.0)
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_device_that_is_not_there_is_refused():
+    with pytest.raises(UserError, match="device cuda: this PyTorch cannot use it; choose one of: cpu"):
+        Learner(small_config(device="cuda"), FRAMES, 30.0)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_learning_on_the_gpu_is_learning_on_the_cpu(features):
+    """The same draws, so the same first iteration but for rounding."""
+    figures = []
+    for device in ("cpu", "cuda"):
+        learner = make_learner(features, small_config(device=device))
+        snapshot, stats = learner.fit(rated(learner), 1)
+        figures.append([stats.loss, *learner.iterate(snapshot)[1].values()])
+    np.testing.assert_allclose(*figures, rtol=0.05, atol=1e-3)
+
+
+def test_any_number_of_threads_gives_the_same_policy(features):
+    ends = []
+    for threads in (1, 2):
+        learner = make_learner(features, small_config(rollouts__threads=threads))
+        snapshot, _ = learner.fit(rated(learner), 1)
+        for _ in range(3):
+            learner.iterate(snapshot)
+        ends.append(learner.policy().weights)
+    for one, two in zip(*ends, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
 def test_the_random_rollouts_are_the_same_each_time(features):
     learner = make_learner(features)
     one, two = learner.random_rollouts(), learner.random_rollouts()

@@ -7,17 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.policy import (
-    HARMONICS,
-    KINDS,
-    Normaliser,
-    Policy,
-    PolicyConfig,
-    ValueFunction,
-    feature_size,
-    mlp,
-    policy_inputs,
-)
+from trainer.inputs import HARMONICS, KINDS, feature_size, policy_inputs
+from trainer.policy import Normaliser, Policy, PolicyConfig, ValueFunction, mlp
 
 
 def policy(kind="clock", seed=0, table=None):
@@ -106,6 +97,19 @@ def test_snapshot_acts_as_the_network():
     assert samples.dtype == np.float32
     np.testing.assert_allclose((samples - mean).std((0, 1)), math.exp(-0.3), rtol=0.02)
     np.testing.assert_allclose(samples.mean(0), mean, atol=0.1)
+
+
+def test_a_snapshot_that_acts_in_torch_acts_as_the_one_in_numpy():
+    trained = policy()
+    obs, clock = np.random.default_rng(0).standard_normal((64, 11)), np.arange(64)
+    plain, torched = trained.snapshot(), trained.snapshot(on_device=True)
+    inputs = plain.inputs(obs, clock)
+    acts = [snapshot.act(inputs, np.random.default_rng(1)) for snapshot in (plain, torched)]
+    np.testing.assert_allclose(*acts, atol=1e-5)
+    before = torched.act(inputs)
+    with torch.no_grad():
+        trained.mean[-1].bias.add_(1.0)
+    np.testing.assert_array_equal(torched.act(inputs), before)
 
 
 def test_snapshot_does_not_change_when_the_policy_does():

@@ -8,10 +8,11 @@ import torch
 from torch.nn.utils import parameters_to_vector
 
 from trainer import envs
+from trainer.fisher import conjugate_gradient, fisher_product, mean_kl
 from trainer.policy import Policy, PolicyConfig
 from trainer.records import Rollouts
 from trainer.rollouts import Collector
-from trainer.trpo import Trpo, TrpoConfig, conjugate_gradient, fisher_product, gae, mean_kl
+from trainer.trpo import Trpo, TrpoConfig, gae
 
 
 def small_policy(seed=0, log_std=-0.2):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,8 @@ class RunConfig:
     """Of every random number in the run."""
     env: str = "hopper"
     """The robot: a name in the registry of ``trainer/envs.py``."""
+    device: str = "cpu"
+    """Where predictor and policy compute: "cpu", "cuda" or "cuda:N"."""
     encoder: str = "efficientnet-lite0"
     """The frozen network that looks at the demo's frames."""
     ratings: RatingsConfig = field(default_factory=RatingsConfig)
@@ -85,6 +88,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
+            raise ValueError(f'device must be "cpu", "cuda" or "cuda:N", got {self.device!r}')
 
 
 def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> RunConfig:

@@ -13,6 +13,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import torch
 
 from trainer import envs
 from trainer.config import RunConfig
@@ -37,11 +38,12 @@ class Learner:
         fps: Frames per second of the demo.
 
     Raises:
-        UserError: If the demo is shorter than a clip.
+        UserError: If the demo is shorter than a clip, or the device cannot be used.
     """
 
     def __init__(self, config: RunConfig, frames: int, fps: float) -> None:
         spec = envs.spec(config.env)
+        check_device(config.device)
         self.config = config
         self.dt = spec.dt
         self.demo_steps, self.clip_steps = lengths(config, frames, fps)
@@ -55,7 +57,7 @@ class Learner:
             action_size=spec.action_size,
             horizon=self.demo_steps,
             seed=config.seed,
-        )
+        ).to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
         self._collector = self._make_collector(config.rollouts.lanes, seed=config.seed, stagger=True)
 
@@ -99,6 +101,7 @@ class Learner:
             self.config.predictor,
             number=number,
             seed=self.config.seed,
+            device=self.config.device,
         )
 
     def predict(self, snapshot: Snapshot, segment: Segment, demo_step: int) -> float:
@@ -115,7 +118,8 @@ class Learner:
         sizes = self.config.rollouts
         left = -(-(sizes.total_steps - self.env_steps) // sizes.lanes)
         steps = max(1, min(sizes.steps, left))
-        rollouts = self._collector.collect(self.policy(), steps)
+        policy = self._policy.snapshot(on_device=self.config.device != "cpu")
+        rollouts = self._collector.collect(policy, steps)
         rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
         stats = self._trpo.update(rollouts, rewards)
         self.iteration += 1
@@ -150,6 +154,16 @@ class Learner:
             physics=rollouts.physics,
         )
         return Collector(env, seed=seed, stagger=stagger)
+
+
+def check_device(device: str) -> None:
+    """Raises UserError if torch cannot compute there, with what it can use."""
+    if device == "cpu":
+        return
+    seen = [f"cuda:{n}" for n in range(torch.cuda.device_count())]
+    if torch.device(device).index not in (None, *range(len(seen))) or not seen:
+        there = ", ".join(["cpu", *seen])
+        raise UserError(f"device {device}: this PyTorch cannot use it; choose one of: {there}")
 
 
 def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:

@@ -34,6 +34,7 @@ from trainer.records import Demo, Segment, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Transitions
 from trainer.store import NewClip, Store
+from trainer.training_set import TrainingSet
 
 log = logging.getLogger("onedemo")
 
@@ -87,6 +88,7 @@ class Trainer:
         self._clips: ClipMaker | None = None
         self._snapshot: Snapshot | None = None
         self._fitted_event = 0
+        self._training_set = TrainingSet(store, run)
         self._pool: Transitions | None = None
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
@@ -242,7 +244,7 @@ class Trainer:
         event = self.store.last_event()
         if event == self._fitted_event or event - self._fitted_event < at_least:
             return False
-        ratings = self.store.training_set(self.run, as_of=event)
+        ratings = self._training_set.at(event)
         if not ratings:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
@@ -368,14 +370,15 @@ class Trainer:
         for row in reversed(self.store.snapshots(self.run)):
             file = self._snapshot_file(row["number"])
             if file.exists():
-                self._snapshot, self._fitted_event = Snapshot.load(file), row["last_event"]
+                self._snapshot = Snapshot.load(file, self.config.device)
+                self._fitted_event = row["last_event"]
                 return
 
     def _load_checkpoint(self, learner: Learner) -> bool:
         file = self.directory / "checkpoint.pt"
         if not file.exists():
             return False
-        saved = torch.load(file, weights_only=True)
+        saved = torch.load(file, weights_only=True, map_location="cpu")
         learner.load_state_dict(saved["learner"])
         # The process may have died between the file and the row.
         self.store.add_iteration(self.run, learner.iteration, **saved["row"])

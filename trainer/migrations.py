@@ -100,6 +100,68 @@ STEPS: tuple[str, ...] = (
             WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
         );
     """,
+    # 2: counts kept by triggers, so that what the page asks at every press does not grow with the
+    # events. The events stay the one truth: everything here can be worked out from them again.
+    # Segments are written as one NPY from here on (trainer/segments.py); older ones stay NPZ.
+    """
+    -- Ratings that hold.
+    CREATE TABLE tallies (
+        run TEXT NOT NULL REFERENCES runs (id),
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        stage TEXT NOT NULL,
+        value INTEGER NOT NULL,
+        ratings INTEGER NOT NULL,
+        PRIMARY KEY (run, rater_id, stage, value)
+    ) WITHOUT ROWID;
+    INSERT INTO tallies
+        SELECT c.run, e.rater_id, c.stage, e.value, COUNT(*)
+        FROM events e JOIN clips c ON c.id = e.clip_id
+        WHERE e.kind = 'rate' AND NOT EXISTS (
+            SELECT 1 FROM events l
+            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
+        )
+        GROUP BY c.run, e.rater_id, c.stage, e.value;
+    -- Ratings and skips of a clip that hold.
+    ALTER TABLE clips ADD COLUMN answers INTEGER NOT NULL DEFAULT 0;
+    UPDATE clips SET answers = held.answers
+        FROM (
+            SELECT e.clip_id, COUNT(*) AS answers FROM events e
+            WHERE e.kind != 'undo' AND NOT EXISTS (
+                SELECT 1 FROM events l
+                WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
+            )
+            GROUP BY e.clip_id
+        ) AS held
+        WHERE clips.id = held.clip_id;
+    CREATE INDEX clips_waiting ON clips (run, state, id) WHERE answers = 0;
+    DROP INDEX clips_by_run;
+    -- Clips ever cut.
+    ALTER TABLE runs ADD COLUMN clips INTEGER NOT NULL DEFAULT 0;
+    UPDATE runs SET clips = (SELECT COUNT(*) FROM clips WHERE clips.run = runs.id);
+    CREATE TRIGGER clips_count AFTER INSERT ON clips BEGIN
+        UPDATE runs SET clips = clips + 1 WHERE id = new.run;
+    END;
+    -- A new event takes the place of the rater's event before it on the same clip, whatever both are.
+    CREATE TRIGGER events_count AFTER INSERT ON events BEGIN
+        UPDATE tallies SET ratings = ratings - 1
+            WHERE (run, stage) = (SELECT run, stage FROM clips WHERE id = new.clip_id)
+            AND rater_id = new.rater_id AND value = (
+                SELECT value FROM events
+                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND id < new.id
+                ORDER BY id DESC LIMIT 1
+            );
+        INSERT INTO tallies
+            SELECT run, new.rater_id, stage, new.value, 1 FROM clips
+            WHERE id = new.clip_id AND new.kind = 'rate'
+            ON CONFLICT DO UPDATE SET ratings = ratings + 1;
+        UPDATE clips SET answers = answers + (new.kind != 'undo') - COALESCE((
+                SELECT kind != 'undo' FROM events
+                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND id < new.id
+                ORDER BY id DESC LIMIT 1
+            ), 0)
+            WHERE id = new.clip_id;
+    END;
+    """,
 )
 
 
@@ -126,4 +188,10 @@ def migrate(connection: sqlite3.Connection) -> None:
     """
     version = check_version(connection)
     for number, step in enumerate(STEPS[version:], start=version + 1):
-        connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")
+        try:
+            connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")
+        except sqlite3.Error:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            if check_version(connection) < number:  # else another process was quicker
+                raise

@@ -9,6 +9,7 @@ Shapes: B any batch shape, o observations, f features, a actions, H demo steps (
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Sequence
@@ -19,8 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-KINDS = ("clock", "table", "pose", "raw")
-HARMONICS = (1, 2, 4, 8, 16)
+from trainer.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
+
 _CLIP = 10.0
 """Normalised inputs are clipped to +- this many standard deviations."""
 
@@ -46,80 +47,6 @@ class PolicyConfig:
             raise ValueError(f"policy.hidden must be positive layer widths, got {self.hidden}")
 
 
-def policy_inputs(
-    obs: np.ndarray,
-    clock: np.ndarray,
-    horizon: int,
-    kind: str,
-    table: np.ndarray | None = None,
-) -> np.ndarray:
-    """Features of a state and a demo time, not normalised.
-
-    Args:
-        obs: Observations, (..., o); index 1 is the torso angle in radians.
-        clock: Demo step of each, (...), 0 to horizon; later counts as horizon.
-        horizon: Demo steps in an episode.
-        kind: One of ``KINDS``.
-        table: For "table": what to show at each demo step, (H, k).
-
-    Returns:
-        Features, (..., f), float64: those of the state, then those of the time.
-
-    Raises:
-        ValueError: If the kind is unknown, or is "table" without one.
-    """
-    if kind not in KINDS:
-        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    state, time = state_features(obs, kind), time_features(horizon, kind, table)
-    if time is None:
-        return state
-    return np.concatenate([state, time[_rows(clock, time)]], axis=-1)
-
-
-def state_features(obs: np.ndarray, kind: str) -> np.ndarray:
-    """Features of a state alone.
-
-    The torso angle is unbounded (it counts turns), so every kind but "raw" shows it as sine and
-    cosine: the second flip then looks like the first.
-
-    Args:
-        obs: Observations, (..., o).
-        kind: One of ``KINDS``.
-
-    Returns:
-        (..., o) for "raw", else (..., o + 1), float64.
-    """
-    if kind == "raw":
-        return np.asarray(obs, np.float64)
-    angle = obs[..., 1:2]
-    return np.concatenate([obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]], axis=-1)
-
-
-def time_features(horizon: int, kind: str, table: np.ndarray | None = None) -> np.ndarray | None:
-    """Features of every demo step, one row each; None for kinds without time.
-
-    Raises:
-        ValueError: If the kind is "table" and there is none.
-    """
-    if kind == "clock":
-        u = np.arange(horizon + 1)[:, None] / horizon
-        phase = 2 * np.pi * u * np.asarray(HARMONICS)
-        return np.concatenate([2 * u - 1, np.sin(phase), np.cos(phase)], axis=1)
-    if kind == "table" and table is None:
-        raise ValueError('kind "table" needs a table (horizon, k)')
-    return table if kind == "table" else None
-
-
-def _rows(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
-    return np.clip(clock, 0, len(time) - 1)
-
-
-def feature_size(obs_size: int, kind: str, table_width: int = 0) -> int:
-    """How many features ``policy_inputs`` gives."""
-    extra = {"clock": 2 + 2 * len(HARMONICS), "table": 1 + table_width, "pose": 1, "raw": 0}
-    return obs_size + extra[kind]
-
-
 @dataclass(frozen=True, slots=True)
 class PolicySnapshot:
     """A policy that never changes: copies of weights and normaliser, in NumPy."""
@@ -138,6 +65,8 @@ class PolicySnapshot:
     """Of the features, (f,), float64."""
     time: np.ndarray | None
     """Normalised inputs of each demo step, float32: they depend on nothing else. None without time."""
+    network: nn.Module | None = None
+    """The network of the mean, a copy on an accelerator, which then acts; None: the weights above do."""
 
     def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
         """Normalised policy inputs of observations (..., o) at demo steps (...): (..., f), float32."""
@@ -146,7 +75,7 @@ class PolicySnapshot:
         state = _normalise(features, self.mean[:width], self.std[:width])
         if self.time is None:
             return state
-        return np.concatenate([state, self.time[_rows(clock, self.time)]], axis=-1)
+        return np.concatenate([state, self.time[rows_of(clock, self.time)]], axis=-1)
 
     def act(self, inputs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
         """Actions for normalised inputs.
@@ -158,10 +87,15 @@ class PolicySnapshot:
         Returns:
             Actions, not clipped, (..., a), float32.
         """
-        x = inputs
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = np.tanh(x @ weight + bias)
-        actions = x @ self.weights[-1] + self.biases[-1]
+        if self.network is not None:
+            with torch.inference_mode():
+                device = next(self.network.parameters()).device
+                actions = self.network(torch.from_numpy(inputs).to(device)).cpu().numpy()
+        else:
+            x = inputs
+            for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+                x = np.tanh(x @ weight + bias)
+            actions = x @ self.weights[-1] + self.biases[-1]
         if rng is not None:
             noise = rng.standard_normal(actions.shape, np.float32)
             actions = actions + np.exp(self.log_std) * noise
@@ -187,7 +121,8 @@ class Normaliser(nn.Module):
 
     def update(self, features: np.ndarray) -> None:
         """Takes in a batch of features, (..., f)."""
-        batch = torch.as_tensor(features, dtype=torch.float64).reshape(-1, len(self.mean))
+        batch = torch.as_tensor(features, dtype=torch.float64, device=self.mean.device)
+        batch = batch.reshape(-1, len(self.mean))
         total = self.count + len(batch)
         shift = batch.mean(0) - self.mean
         spread = batch.var(0, correction=0) * len(batch) + self.var * self.count
@@ -251,10 +186,21 @@ class Policy(nn.Module):
         kind, horizon = self.config.kind, self.horizon
         self.normaliser.update(policy_inputs(obs, clock, horizon, kind, self.table))
 
-    def snapshot(self) -> PolicySnapshot:
-        """The policy as it is now, in copies."""
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return self.log_std.device
+
+    def snapshot(self, *, on_device: bool = False) -> PolicySnapshot:
+        """The policy as it is now, in copies.
+
+        Args:
+            on_device: Let it act where the policy is, which pays with thousands of lanes on an
+                accelerator; else in NumPy.
+        """
         layers = [layer for layer in self.mean if isinstance(layer, nn.Linear)]
-        mean, std = self.normaliser.mean.numpy().copy(), np.sqrt(self.normaliser.var.numpy() + 1e-8)
+        mean = self.normaliser.mean.cpu().numpy().copy()
+        std = np.sqrt(self.normaliser.var.cpu().numpy() + 1e-8)
         time = time_features(self.horizon, self.config.kind, self.table)
         if time is not None:
             width = time.shape[1]
@@ -262,12 +208,13 @@ class Policy(nn.Module):
         return PolicySnapshot(
             kind=self.config.kind,
             horizon=self.horizon,
-            weights=tuple(layer.weight.detach().numpy().T.copy() for layer in layers),
-            biases=tuple(layer.bias.detach().numpy().copy() for layer in layers),
-            log_std=self.log_std.detach().numpy().copy(),
+            weights=tuple(layer.weight.detach().cpu().numpy().T.copy() for layer in layers),
+            biases=tuple(layer.bias.detach().cpu().numpy().copy() for layer in layers),
+            log_std=self.log_std.detach().cpu().numpy().copy(),
             mean=mean,
             std=std,
             time=time,
+            network=copy.deepcopy(self.mean).requires_grad_(False) if on_device else None,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -279,7 +226,7 @@ class Policy(nn.Module):
             "action_size": self.action_size,
             "horizon": self.horizon,
             "table": None if self.table is None else torch.from_numpy(self.table.copy()),
-            "state": {name: value.detach().clone() for name, value in self.state_dict().items()},
+            "state": {name: value.detach().cpu().clone() for name, value in self.state_dict().items()},
         }
 
     @classmethod

@@ -49,7 +49,7 @@ class PredictorConfig:
     """Of stochastic gradient descent with momentum 0.9."""
     weight_decay: float = 1e-4
     """L2 penalty."""
-    batch_clips: int = 60
+    batch_clips: int = 30
     """Clips in a batch."""
     pairs_per_clip: int = 4
     """(frame, state-action) pairs drawn from each of them."""
@@ -175,7 +175,8 @@ class Snapshot:
         self._net = net.eval().requires_grad_(False)
         self._visual = visual
         self._mean, self._std = mean, std
-        self._folded = net.fuse_visual(torch.from_numpy(visual))
+        self._device = net.fuse_visual.weight.device
+        self._folded = net.fuse_visual(torch.from_numpy(visual).to(self._device))
 
     def probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Probability of each rating.
@@ -189,11 +190,12 @@ class Snapshot:
             (..., 5), float32, for ratings 1 to 5.
         """
         inputs = (standard_inputs(obs, actions) - self._mean) / self._std
-        flat = torch.from_numpy(inputs.reshape(-1, STANDARD_DIMS))
-        index = torch.from_numpy(np.ascontiguousarray(frames).reshape(-1).astype(np.int64))
+        flat = torch.from_numpy(inputs.reshape(-1, STANDARD_DIMS)).to(self._device)
+        index = torch.from_numpy(np.ascontiguousarray(frames).reshape(-1).astype(np.int64)).to(self._device)
         with torch.inference_mode():
             fused = self._net.fuse_standard(self._net.standard(flat)) + self._folded[index]
-            return functional.softmax(self._net.head(fused), dim=-1).numpy().reshape(*frames.shape, CLASSES)
+            probabilities = functional.softmax(self._net.head(fused), dim=-1)
+        return probabilities.cpu().numpy().reshape(*frames.shape, CLASSES)
 
     def ratings(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The predicted rating of each pair, (...), 1..5: the reward. Arguments as ``probabilities``."""
@@ -209,7 +211,7 @@ class Snapshot:
             {
                 "number": self.number,
                 "config": asdict(self.config),
-                "net": self._net.state_dict(),
+                "net": {name: x.cpu() for name, x in self._net.state_dict().items()},
                 "visual": torch.from_numpy(self._visual),
                 "mean": torch.from_numpy(self._mean),
                 "std": torch.from_numpy(self._std),
@@ -219,14 +221,14 @@ class Snapshot:
         write_atomic(path, buffer.getvalue())
 
     @classmethod
-    def load(cls, path: Path) -> Snapshot:
-        """Reads what ``save`` wrote; runs no code from the file."""
+    def load(cls, path: Path, device: str = "cpu") -> Snapshot:
+        """Reads what ``save`` wrote, onto a torch device; runs no code from the file."""
         data = torch.load(path, weights_only=True)
         config = PredictorConfig(**data["config"])
         net = SimilarityNet(data["visual"].shape[1], config, torch.Generator())
         net.load_state_dict(data["net"])
         return cls(
-            number=data["number"], config=config, net=net, visual=data["visual"].numpy(),
+            number=data["number"], config=config, net=net.to(device), visual=data["visual"].numpy(),
             mean=data["mean"].numpy(), std=data["std"].numpy(),
         )  # fmt: skip
 
@@ -244,7 +246,7 @@ class FitStats:
 
 def fit(
     ratings: Sequence[RatedSegment], frames: np.ndarray, visual: np.ndarray, config: PredictorConfig,
-    *, number: int, seed: int,
+    *, number: int, seed: int, device: str = "cpu",
 ) -> tuple[Snapshot, FitStats]:  # fmt: skip
     """Fits a predictor from scratch on all ratings: the same ratings and seed give the same weights.
 
@@ -255,6 +257,7 @@ def fit(
         config: How.
         number: The snapshot's number.
         seed: Of the initial weights and of the batches.
+        device: Where torch computes; what is drawn at random is the same everywhere.
 
     Returns:
         The snapshot and how the fit went.
@@ -268,20 +271,22 @@ def fit(
     obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
     inputs = standard_inputs(obs, actions)
     mean, std = inputs.mean(axis=(0, 1)), inputs.std(axis=(0, 1)) + 0.05
-    standard_nWS = torch.from_numpy((inputs - mean) / std)
+    standard_nWS = torch.from_numpy((inputs - mean) / std).to(device)
     # Looked up frame by frame: with many ratings the visual inputs of all pairs would fill the memory.
-    frames_nW, visual_FV = torch.from_numpy(frames.astype(np.int64)), torch.from_numpy(visual)
+    frames_nW = torch.from_numpy(frames.astype(np.int64)).to(device)
+    visual_FV = torch.from_numpy(visual).to(device)
     classes_n = torch.tensor([r.value - 1 for r in ratings])
-    net = SimilarityNet(visual.shape[1], config, generator)
+    net = SimilarityNet(visual.shape[1], config, generator).to(device)
     optimiser = torch.optim.SGD(
         net.parameters(), lr=config.learning_rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
     )
     counts = torch.bincount(classes_n, minlength=CLASSES)
-    weights = class_weights(counts) if config.class_weights else None
+    weights = class_weights(counts).to(device) if config.class_weights else None
     chance_n = (1.0 / counts[classes_n]) if config.sampling == "equal" else torch.ones(len(ratings))
     clips, pairs = config.updates * config.batch_clips, config.pairs_per_clip
     drawn = torch.multinomial(chance_n, clips, replacement=True, generator=generator)
     steps = torch.randint(standard_nWS.shape[1], (clips, pairs), generator=generator)
+    drawn, steps, classes_n = drawn.to(device), steps.to(device), classes_n.to(device)
     losses = []
     for update, (clip, step) in enumerate(
         zip(drawn.split(config.batch_clips), steps.split(config.batch_clips), strict=True)

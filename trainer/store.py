@@ -1,12 +1,12 @@
 """All SQL: people, runs, clips and rating events in one SQLite file.
 
-One connection, one lock: every call is short. A write returns after ``COMMIT`` with
+One connection, one lock: every call is short, whatever the number of ratings; what reads all of them
+does so over a connection of its own. A write returns after ``COMMIT`` with
 ``synchronous=FULL``, so what it acknowledged survives the death of the process and of the machine.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import sqlite3
 import threading
@@ -15,12 +15,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-
-import numpy as np
+from typing import NamedTuple
 
 from trainer.errors import UserError
 from trainer.migrations import check_version, migrate
 from trainer.records import Clip, Rater, Segment
+from trainer.segments import pack_segment, unpack_segment
 
 FILE_NAME = "onedemo.sqlite3"
 
@@ -45,9 +45,18 @@ class NewClip:
     predicted: float | None = None
 
 
+class Rating(NamedTuple):
+    """One rating that holds: a row of the training set."""
+
+    event: int
+    clip: int
+    demo_step: int
+    value: int
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RatedSegment:
-    """One rating that holds, with what was rated: a row of the training set."""
+    """One rating that holds, with what was rated: what a predictor is fitted on."""
 
     event: int
     demo_step: int
@@ -170,7 +179,8 @@ class Store:
         with self._transaction() as db:
             try:
                 db.execute(
-                    "INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?)",
+                    "INSERT INTO runs (id, demo, demo_sha256, seed, config, version, created_at)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?)",
                     (run, demo, demo_sha256, seed, config, version, _now()),
                 )
             except sqlite3.IntegrityError:
@@ -235,17 +245,15 @@ class Store:
     def waiting_clips(self, run: str, state: str = "ready") -> list[Clip]:
         """Clips in that state that nobody has rated or skipped, oldest first."""
         rows = self._rows(
-            f"SELECT {_CLIP} FROM clips c WHERE run = ? AND state = ? AND NOT EXISTS ("
-            " SELECT 1 FROM events e WHERE e.clip_id = c.id AND e.kind != 'undo' AND NOT EXISTS ("
-            "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
-            "  AND l.id > e.id)) ORDER BY id",
+            f"SELECT {_CLIP} FROM clips WHERE run = ? AND state = ? AND answers = 0 ORDER BY id",
             (run, state),
         )
         return [Clip(**dict(zip(_CLIP.split(", "), row, strict=True))) for row in rows]
 
     def count_clips(self, run: str) -> int:
         """How many clips were ever cut in a run."""
-        return self._rows("SELECT COUNT(*) FROM clips WHERE run = ?", (run,))[0][0]
+        rows = self._rows("SELECT clips FROM runs WHERE id = ?", (run,))
+        return rows[0][0] if rows else 0
 
     def segment(self, clip_id: int) -> Segment:
         """The states and actions behind a clip.
@@ -313,51 +321,46 @@ class Store:
         """Number of the newest event of all runs, 0 if there is none."""
         return self._rows("SELECT MAX(id) FROM events")[0][0] or 0
 
-    def training_set(self, run: str, as_of: int | None = None) -> list[RatedSegment]:
+    def training_set(self, run: str, as_of: int | None = None) -> list[Rating]:
         """The ratings of a run that held when event ``as_of`` was written (default: now), in order.
 
-        The same events give the same list, so a snapshot can be traced to its ratings and made again.
+        The same events give the same list, so a snapshot can be traced to its ratings and made again
+        (``TrainingSet`` adds the segments).
         """
         limit = as_of if as_of is not None else 2**62
-        rows = self._rows(
-            "SELECT e.id, c.demo_step, s.data, e.value FROM events e"
-            " JOIN clips c ON c.id = e.clip_id JOIN segments s ON s.clip_id = e.clip_id"
+        rows = self._stream(
+            "SELECT e.id, e.clip_id, c.demo_step, e.value FROM events e JOIN clips c ON c.id = e.clip_id"
             " WHERE c.run = ? AND e.kind = 'rate' AND e.id <= ? AND NOT EXISTS ("
             "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
             "  AND l.id > e.id AND l.id <= ?) ORDER BY e.id",
             (run, limit, limit),
         )
-        return [
-            RatedSegment(event=i, demo_step=step, segment=unpack_segment(data), value=value)
-            for i, step, data, value in rows
-        ]
+        return [Rating._make(row) for row in rows]
 
     def ratings_by_class(self, run: str | None = None) -> list[int]:
         """How many ratings of 1, 2, 3, 4 and 5 hold, in one run or in all."""
-        rows = self._rows(
-            "SELECT value, COUNT(*) FROM ratings WHERE ?1 IS NULL OR run = ?1 GROUP BY value",
-            (run,),
-        )
-        counts = dict(rows)
+        where, values = ("", ()) if run is None else ("WHERE run = ?", (run,))
+        counts = dict(self._rows(f"SELECT value, SUM(ratings) FROM tallies {where} GROUP BY value", values))
         return [counts.get(value, 0) for value in range(1, 6)]
 
-    def ratings_of(self, run: str, rater_id: int) -> int:
-        """How many ratings of one rater hold in a run."""
-        return self._rows(
-            "SELECT COUNT(*) FROM ratings WHERE run = ? AND rater = (SELECT name FROM raters WHERE id = ?)",
-            (run, rater_id),
-        )[0][0]
+    def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
+        """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""
+        rows = self._rows(
+            "SELECT name, stage, value, ratings FROM tallies JOIN raters ON raters.id = rater_id"
+            " WHERE run = ? AND ratings > 0 ORDER BY name, stage",
+            (run,),
+        )
+        counts: dict[tuple[str, str], list[int]] = {}
+        for name, stage, value, ratings in rows:
+            counts.setdefault((name, stage), [0] * 5)[value - 1] = ratings
+        return counts
 
     def iter_ratings(self, run: str | None = None) -> Iterator[tuple]:
-        """Rows of the view ``ratings`` in order of their number, streamed (own read-only connection)."""
-        db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
-        try:
-            yield from db.execute(
-                f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
-                (run,),
-            )
-        finally:
-            db.close()
+        """Rows of the view ``ratings`` in order of their number, streamed."""
+        return self._stream(
+            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
+            (run,),
+        )
 
     # What the trainer did
 
@@ -410,18 +413,13 @@ class Store:
         with self._lock:
             return self._db.execute(sql, values).fetchall()
 
-
-def pack_segment(segment: Segment) -> bytes:
-    """A segment as the bytes of an NPZ file, float64."""
-    buffer = io.BytesIO()
-    np.savez(buffer, obs=segment.obs, actions=segment.actions, qpos=segment.qpos, qvel=segment.qvel)
-    return buffer.getvalue()
-
-
-def unpack_segment(data: bytes) -> Segment:
-    """The reverse of ``pack_segment``."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return Segment(**{name: arrays[name] for name in ("obs", "actions", "qpos", "qvel")})
+    def _stream(self, sql: str, values: Sequence) -> Iterator[tuple]:
+        """Rows one by one, over a read-only connection of their own: no press waits for them."""
+        db = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
+        try:
+            yield from db.execute(sql, values)
+        finally:
+            db.close()
 
 
 def _now() -> str:

@@ -12,7 +12,7 @@ Shapes: N lanes, T steps, B = N T samples, f inputs, a actions, P policy paramet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from trainer.fisher import conjugate_gradient, fisher_product, mean_kl
 from trainer.policy import Policy, ValueFunction
 from trainer.records import Rollouts
 
@@ -114,7 +114,7 @@ class Trpo:
     def __init__(self, policy: Policy, config: TrpoConfig, *, seed: int, threads: int = 1) -> None:
         self.policy = policy
         self.config = config
-        self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed)
+        self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed).to(policy.device)
         self._parameters = [*policy.mean.parameters(), policy.log_std]
         # Fused: one pass over the parameters; they are few, and the calls would cost more than the sums.
         self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate, fused=True)
@@ -136,8 +136,9 @@ class Trpo:
         """
         if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
-        inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1)
-        actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1)
+        device = self.policy.device
+        inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1).to(device)
+        actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1).to(device)
         ended_NT = rollouts.terminated | rollouts.truncated
         values_NT, next_values_NT = self._values(rollouts, ended_NT)
         advantages_NT = gae(
@@ -152,8 +153,8 @@ class Trpo:
         returns_NT = advantages_NT + values_NT
         spread = advantages_NT.std() + 1e-8
         standard_NT = (advantages_NT - advantages_NT.mean()) / spread
-        advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten()
-        returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten()
+        advantages_B = torch.from_numpy(standard_NT.astype(np.float32)).flatten().to(device)
+        returns_B = torch.from_numpy(returns_NT.astype(np.float32)).flatten().to(device)
         # All that is random is drawn here, in one order, whichever of the two below runs first.
         sample = self._permutation(len(inputs_Bf))[: self.config.fisher_samples]
         orders = [self._permutation(len(inputs_Bf)) for _ in range(self.config.value_epochs)]
@@ -190,17 +191,17 @@ class Trpo:
         self._generator.set_state(state["generator"])
 
     def _permutation(self, count: int) -> torch.Tensor:
-        return torch.randperm(count, generator=self._generator)
+        return torch.randperm(count, generator=self._generator).to(self.policy.device)
 
     def _values(self, rollouts: Rollouts, ended_NT: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """V before and after each step: one pass, as the state after a step is the next one's."""
         with torch.no_grad():
             whole = np.concatenate([rollouts.inputs, rollouts.next_inputs[:, -1:]], axis=1)
-            values_NT1 = self.value(torch.from_numpy(whole)).numpy()
+            values_NT1 = self.value(torch.from_numpy(whole).to(self.policy.device)).cpu().numpy()
             next_values_NT = values_NT1[:, 1:].copy()
             if ended_NT.any():
-                last = self.value(torch.from_numpy(rollouts.next_inputs[ended_NT]))
-                next_values_NT[ended_NT] = last.numpy()
+                last = torch.from_numpy(rollouts.next_inputs[ended_NT]).to(self.policy.device)
+                next_values_NT[ended_NT] = self.value(last).cpu().numpy()
         return values_NT1[:, :-1], next_values_NT
 
     def _improve(
@@ -300,103 +301,6 @@ def gae(
         later_N = deltas_NT[:, t] + carry_NT[:, t] * later_N
         advantages_NT[:, t] = later_N
     return advantages_NT
-
-
-def conjugate_gradient(
-    product: Callable[[torch.Tensor], torch.Tensor],
-    b: torch.Tensor,
-    iterations: int,
-    tolerance: float = 1e-10,
-) -> torch.Tensor:
-    """Solves A x = b for a symmetric positive definite A (Hestenes and Stiefel 1952).
-
-    Args:
-        product: Multiplies a vector (P,) by A.
-        b: Right-hand side, (P,).
-        iterations: At most this many; P of them are exact but for rounding.
-        tolerance: Stop when the squared residual is below this.
-
-    Returns:
-        x, (P,).
-    """
-    x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
-    square = residual @ residual
-    for _ in range(iterations):
-        if square < tolerance:
-            break
-        image = product(direction)
-        length = square / (direction @ image)
-        x += length * direction
-        residual -= length * image
-        square, previous = residual @ residual, square
-        direction = residual + square / previous * direction
-    return x
-
-
-def mean_kl(
-    old_mean_Ba: torch.Tensor,
-    old_log_std: torch.Tensor,
-    new_mean_Ba: torch.Tensor,
-    new_log_std: torch.Tensor,
-) -> torch.Tensor:
-    """Mean KL(old || new) of diagonal Gaussians, nats.
-
-    Args:
-        old_mean_Ba: (B, a).
-        old_log_std: (a,).
-        new_mean_Ba: (B, a).
-        new_log_std: (a,).
-    """
-    variance_ratio = torch.exp(2 * (old_log_std - new_log_std))
-    shift_Ba = (new_mean_Ba - old_mean_Ba) * torch.exp(-new_log_std)
-    kl_Ba = 0.5 * (variance_ratio + shift_Ba.square() - 1) + new_log_std - old_log_std
-    return kl_Ba.sum(-1).mean()
-
-
-def fisher_product(
-    policy: Policy, inputs_Bf: torch.Tensor, damping: float
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The function v -> (F + damping I) v, F the mean Fisher matrix of the policy at the inputs.
-
-    F is the Hessian of KL(policy now || policy) at the policy now (Schulman et al. 2015, appendix C).
-    For a Gaussian that is F = mean of J^T S^-1 J for the network of the mean, J its Jacobian and S the
-    covariance, and 2 I for the log deviations. The product runs forwards (J v) and backwards (J^T u)
-    through the tanh network, with its activations worked out once: half the arithmetic of
-    differentiating the KL twice.
-
-    Args:
-        policy: Not changed; its parameters at the time of the call count.
-        inputs_Bf: Normalised inputs, (B, f).
-        damping: Added to the diagonal.
-    """
-    layers = [layer for layer in policy.mean if isinstance(layer, nn.Linear)]
-    weights = [layer.weight.detach().clone() for layer in layers]
-    shapes = [shape for layer in layers for shape in (layer.weight.shape, layer.bias.shape)]
-    sizes = [shape.numel() for shape in shapes]
-    precision_a = torch.exp(-2 * policy.log_std.detach()) / len(inputs_Bf)
-    activations, slopes = [inputs_Bf], []
-    for layer in layers[:-1]:
-        activations.append(torch.tanh(layer(activations[-1])).detach())
-        slopes.append(1 - activations[-1].square())
-
-    def product(v_P: torch.Tensor) -> torch.Tensor:
-        parts = v_P.split([*sizes, len(precision_a)])
-        steps = [part.view(shape) for part, shape in zip(parts[:-1], shapes, strict=True)]
-        tangent = torch.addmm(steps[1], activations[0], steps[0].T)
-        for i in range(1, len(layers)):
-            tangent.mul_(slopes[i - 1])
-            tangent = torch.addmm(steps[2 * i + 1], tangent, weights[i].T).addmm_(
-                activations[i], steps[2 * i].T
-            )
-        grads: list[torch.Tensor] = [2 * parts[-1]]
-        back = tangent * precision_a
-        for i in range(len(layers) - 1, -1, -1):
-            grads[:0] = [(back.T @ activations[i]).reshape(-1), back.sum(0)]
-            if i:
-                back = (back @ weights[i]).mul_(slopes[i - 1])
-        return torch.cat(grads).add_(v_P, alpha=damping)
-
-    return product
 
 
 def _one_thread() -> None:

@@ -98,8 +98,8 @@ def by_turns(
 
 
 def ratio(
-    name: str, what: str, *, ours: Sequence[float], theirs: Sequence[float], against: str, reach: float | None,
-    equal: str, unit: str, at_least: bool = True, higher_is_better: bool = True,
+    name: str, what: str, *, ours: Sequence[float], theirs: Sequence[float], against: str,
+    reach: float | None, equal: str, unit: str, at_least: bool = True, higher_is_better: bool = True,
 ) -> Figure:  # fmt: skip
     """Our figure over theirs, turn by turn.
 

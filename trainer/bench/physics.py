@@ -1,0 +1,208 @@
+"""Physics: our batched Hopper beside the simulator's own limit and beside other batched Hoppers.
+
+A rate is control steps per second, all lanes together. N lanes, T control steps, a actions.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+import gymnasium
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from trainer import envs
+from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
+
+LANES = 64
+MISSING = "{} is not installed: pip install -e '.[bench]'"
+"""Why a comparison was skipped."""
+_SPEC = envs.SPECS["hopper"]
+_FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
+
+
+class Bare:
+    """``mujoco.rollout`` on the stock model and nothing around it: what any batched Hopper can reach.
+
+    Args:
+        lanes: N.
+        threads: Of the pool; all this process may use if None.
+    """
+
+    def __init__(self, lanes: int, threads: int | None = None) -> None:
+        self._models = [mujoco.MjModel.from_xml_path(str(_SPEC.xml))] * lanes
+        threads = min(cores(), lanes) if threads is None else threads
+        self._pool = rollout.Rollout(nthread=threads)
+        self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, threads))]
+
+    def run(self, states_NS: np.ndarray, actions_TNa: np.ndarray) -> float:
+        """Steps the lanes once per row of actions, one call each, as a policy in the loop must.
+
+        Returns:
+            Seconds.
+        """
+        lanes, skip = len(states_NS), _SPEC.frame_skip
+        out = np.empty((lanes, skip, states_NS.shape[1]))
+        control = np.empty((lanes, skip, actions_TNa.shape[2]))
+        began = time.perf_counter()
+        for actions in actions_TNa:
+            control[:] = actions[:, None]
+            self._pool.rollout(
+                self._models, self._data, states_NS, control, control_spec=_CONTROL, skip_checks=True,
+                nstep=skip, state=out,
+            )  # fmt: skip
+            states_NS = out[:, -1].copy()
+        return time.perf_counter() - began
+
+    def close(self) -> None:
+        """Ends the pool's threads."""
+        self._pool.close()
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def full_states(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """Positions (N, q) and velocities (N, v) as MuJoCo's full physics states at time 0, (N, S)."""
+    return np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
+
+
+def measure(quick: bool = False) -> list[Result]:
+    """Our batched Hopper against bare MuJoCo, envpool and gymnasium, and the rate for 1 to 512 lanes."""
+    turns, steps = (9, 40) if quick else (25, 125)
+    return [
+        *_against_bare(turns, steps),
+        *_against_envpool(turns, steps),
+        *_against_gymnasium(3 if quick else 9, steps, quick),
+        _by_lanes(3 if quick else 9, quick),
+    ]
+
+
+def _against_bare(turns: int, steps: int) -> list[Result]:
+    rates = _ours_and_bare(LANES, steps, turns)
+    return [
+        ratio(
+            "physics_vs_bare", f"physics, batched Hopper, {LANES} lanes",
+            ours=rates["ours"], theirs=rates["bare"], against=f"mujoco.rollout bare, {cores()} threads",
+            reach=0.95, unit="steps/s",
+            equal="the same states and actions, one call per control step, all cores; bare without argument "
+            "checks; ours also gives observations and rewards, and does not look for constraint islands",
+        )
+    ]  # fmt: skip
+
+
+def _ours_and_bare(lanes: int, steps: int, turns: int) -> dict[str, list[float]]:
+    env, bare = envs.make("hopper", lanes, horizon=10**9), Bare(lanes)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (steps, lanes, _SPEC.action_size))
+    for action in actions[:100]:  # spread: some fall, some fly
+        env.step(action)
+    qpos, qvel, every = env.qpos, env.qvel, np.arange(lanes)
+
+    def ours() -> float:
+        env.set_states(every, qpos, qvel)
+        return _rate(env.step, actions)
+
+    def theirs() -> float:
+        return actions[..., 0].size / bare.run(full_states(qpos, qvel), actions)
+
+    rates = by_turns({"ours": ours, "bare": theirs}, turns)
+    env.close()
+    bare.close()
+    return rates
+
+
+def _rate(step: Callable[[np.ndarray], object], actions: np.ndarray) -> float:
+    began = time.perf_counter()
+    for action in actions:
+        step(action)
+    return actions[..., 0].size / (time.perf_counter() - began)
+
+
+def _against_envpool(turns: int, steps: int) -> list[Result]:
+    try:
+        import envpool
+    except ImportError:
+        return [
+            Skipped(name="physics_vs_envpool", reason="envpool is not installed: pip install -e '.[bench]'")
+        ]
+    peer = envpool.make_gymnasium("Hopper-v4", num_envs=LANES, num_threads=cores(), seed=0)
+    env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
+    env.reset(seed=0)
+    peer.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, LANES, _SPEC.action_size))
+    rates = by_turns(
+        {"ours": lambda: _rate(env.step, actions), "envpool": lambda: _rate(peer.step, actions)}, turns
+    )
+    env.close()
+    peer.close()
+    return [
+        ratio(
+            "physics_vs_envpool", "the same, episodes that end at a fall",
+            ours=rates["ours"], theirs=rates["envpool"], against=f"envpool {envpool.__version__} Hopper-v4",
+            reach=1.0, unit="steps/s",
+            equal=f"{LANES} lanes, {cores()} threads, the same random actions, both restart after a fall",
+        )
+    ]  # fmt: skip
+
+
+def _against_gymnasium(turns: int, steps: int, quick: bool) -> list[Result]:
+    """Against the better of both vector environments, each with its best number of lanes."""
+    steps = min(steps, 100)
+    makers: dict[str, Callable[[], gymnasium.vector.VectorEnv]] = {}
+    for count in (1, 8) if quick else (1, 4, 16, 64):
+        makers[f"SyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.SyncVectorEnv([_hopper] * n)
+    for count in (2,) if quick else (2, 4, 16):
+        makers[f"AsyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.AsyncVectorEnv([_hopper] * n)
+    pilot = {name: _gymnasium_rate(make, steps, 2)[-1] for name, make in makers.items()}
+    best = max(pilot, key=lambda name: pilot[name])
+    env, peer = envs.make("hopper", LANES, terminate_when_unhealthy=True), makers[best]()
+    env.reset(seed=0)
+    peer.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, LANES, _SPEC.action_size))
+    long = np.random.default_rng(0).uniform(-1, 1, (steps, peer.num_envs, _SPEC.action_size))
+    sides = {"ours": lambda: _rate(env.step, actions), "gymnasium": lambda: _rate(peer.step, long)}
+    rates = by_turns(sides, turns)
+    env.close()
+    peer.close()
+    tried = ", ".join(f"{name} lanes {rate:,.0f}" for name, rate in pilot.items())
+    return [
+        ratio(
+            "physics_vs_gymnasium", "the same", ours=rates["ours"], theirs=rates["gymnasium"],
+            against=f"gymnasium {gymnasium.__version__} {best} lanes", reach=1.5, unit="steps/s",
+            equal=f"Hopper-v5, random actions, both end and restart at a fall; tried (steps/s): {tried}",
+        )
+    ]  # fmt: skip
+
+
+def _hopper() -> gymnasium.Env:
+    return gymnasium.make("Hopper-v5")
+
+
+def _gymnasium_rate(make: Callable[[], gymnasium.vector.VectorEnv], steps: int, turns: int) -> list[float]:
+    env = make()
+    env.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, env.num_envs, _SPEC.action_size))
+    rates = [_rate(env.step, actions) for _ in range(turns)]
+    env.close()
+    return rates
+
+
+def _by_lanes(turns: int, quick: bool) -> Growth:
+    sizes = (1, 8, 64, 512) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+    ours, bare = [], []
+    for lanes in sizes:
+        rates = _ours_and_bare(lanes, max(10, (2_000 if quick else 8_000) // lanes), turns)
+        ours.append(float(np.median(rates["ours"])))
+        bare.append(float(np.median(rates["bare"])))
+    return Growth(
+        name="physics_lanes", title="Physics by lanes", x_label="lanes", y_label="control steps/s",
+        x=sizes, y={"onedemo": ours, "mujoco.rollout bare": bare},
+    )  # fmt: skip
