@@ -4,10 +4,11 @@ The same model, integrator (Runge-Kutta 4) and time step as on the processor, in
 
 Agreement with ``envs.RolloutPhysics``, measured on Warp's processor device: 256,000 control steps of
 hoppers flying, standing and fallen under random actions, each begun in the same state. Positions (m,
-rad) differ by 1e-7 in the median, 1.4e-6 in 9,999 of 10,000; velocities (m/s, rad/s) by 5e-7 and
-1e-5. Stated tolerance: 5e-6 and 5e-5. Beyond it (3 steps in 100,000, up to 2e-4 and 7e-2, in longer
-runs 0.3) the dynamics themselves jump, as a contact sets in or not: the processor's own answer changes
-as much when its state is moved by 3e-7. Errors grow along a trajectory, as the robot's motion is chaotic:
+rad) differ by 1e-7 in the median and by 1e-6 in 999 of 1,000 steps; velocities (m/s, rad/s) by 5e-7
+and 5e-6. Stated tolerance: 5e-6 and 5e-5. Beyond it (11 steps in 100,000, up to 1e-3 and 0.3) the
+dynamics themselves jump, as a contact sets in or not: in every such step that was looked at, the
+processor's own answer changed as much when its state was moved by 3e-7 (velocities: 1e-6). Errors
+grow along a trajectory, as the robot's motion is chaotic:
 
     after control steps        1        5        25       100
     positions, median          1e-7     2e-7     5e-7     4e-6
