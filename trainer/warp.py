@@ -17,7 +17,7 @@ grow along a trajectory, as the robot's motion is chaotic:
     velocities, 9 of 10 lanes  9e-7     3e-6     1e-5     9e-5
 
 The one lane in hundreds that a jump has parted goes a way of its own. Rounding the processor's states
-to float32 after each step does half of all that, with the same outliers.
+to float32 after each step does half of all that, with outliers of the same kind.
 
 A saved state goes on exactly on the processor device. On a GPU it need not: MuJoCo Warp adds a lane's
 contacts in the order in which its threads finish (its option ``deterministic`` does not sort them yet).
