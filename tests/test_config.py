@@ -42,6 +42,7 @@ def test_overrides_beat_the_file(tmp_path):
         ("[trpo]\nmax_kl = -1", "trpo.max_kl must be > 0 nats, got -1"),
         ("[ratings]\nonline = -1", "ratings.online must be at least 0, got -1"),
         ("[predictor]\nsampling = 'often'", "predictor.sampling must be"),
+        ("[rollouts]\nphysics = 'gpu'", "rollouts.physics must be 'mujoco' or 'warp', got 'gpu'"),
         ("seed = ", "not valid TOML"),
     ],
 )

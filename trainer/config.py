@@ -58,9 +58,13 @@ class RolloutConfig:
     """Control steps, all lanes together, after which the run is done."""
     threads: int = 2
     """Threads of the physics and of the learning. Any number gives the same numbers."""
+    physics: str = "mujoco"
+    """Where the robot is simulated: "mujoco", the processor, or "warp", an NVIDIA GPU (extra ``warp``)."""
 
     def __post_init__(self) -> None:
         _at_least(self, "rollouts", lanes=1, steps=1, total_steps=1, threads=1)
+        if self.physics not in ("mujoco", "warp"):
+            raise ValueError(f"rollouts.physics must be 'mujoco' or 'warp', got {self.physics!r}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,9 +1,9 @@
 """Batched MuJoCo environments behind ``gymnasium.vector.VectorEnv``, and the registry of them.
 
-All lanes are stepped by one call into MuJoCo's C++ thread pool (``mujoco.rollout``); nothing here
-loops over lanes in Python. A lane's whole physical state is (time, qpos, qvel): the contact
-solver's warm start is cleared before each control step, so a state that was saved and put back
-goes on exactly as it would have.
+All lanes are stepped by one call, into MuJoCo's C++ thread pool (``mujoco.rollout``) or into the
+optional ``trainer/warp.py``; nothing here loops over lanes in Python. A lane's whole physical state
+is (time, qpos, qvel): the contact solver's warm start is cleared before each control step, so a
+state that was saved and put back goes on exactly as it would have.
 
 Shapes: N lanes, o observations, a actions, q = v positions and velocities, S = 1 + q + v.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 import mujoco
@@ -108,12 +108,13 @@ def make(
     *,
     horizon: int | None = None,
     nthread: int | None = None,
+    physics: str = "mujoco",
     terminate_when_unhealthy: bool = False,
 ) -> HopperVectorEnv:
     """Makes N lanes of a registered environment. Options as for ``HopperVectorEnv``.
 
     Raises:
-        UserError: If the environment is unknown.
+        UserError: If the environment is unknown, or the physics is not installed.
         ValueError: If an option is out of range.
     """
     return HopperVectorEnv(
@@ -121,6 +122,7 @@ def make(
         env_spec=spec(name),
         horizon=horizon,
         nthread=nthread,
+        physics=physics,
         terminate_when_unhealthy=terminate_when_unhealthy,
     )
 
@@ -175,6 +177,59 @@ def healthy(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray
     return inside & (low_z < z) & (z < high_z) & (low_angle < angle) & (angle < high_angle)
 
 
+class Physics(Protocol):
+    """What moves the lanes: rigid-body dynamics with no memory besides the states it is given."""
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """One control step of every lane, the same action held through its physics steps.
+
+        Args:
+            states: (time, qpos, qvel), (N, S), float64; not changed.
+            actions: (N, a), float64; the motors clamp them.
+
+        Returns:
+            The states after it, (N, S), float64, a fresh array.
+        """
+        ...
+
+    def close(self) -> None:
+        """Frees threads or device memory."""
+        ...
+
+
+class RolloutPhysics:
+    """``Physics`` on MuJoCo's own C++ thread pool, in float64.
+
+    Args:
+        model: The robot.
+        frame_skip: Physics steps in a control step.
+        num_envs: Lanes.
+        nthread: Threads beside the caller's; 0 for none.
+    """
+
+    def __init__(self, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> None:
+        self._models = [model] * num_envs
+        self._frame_skip = frame_skip
+        self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]
+        self._pool = rollout.Rollout(nthread=nthread)
+        self._substeps = np.empty((num_envs, frame_skip, mujoco.mj_stateSize(model, _FULL)))
+        self._control = np.empty((num_envs, frame_skip, model.nu))
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """See ``Physics.step``."""
+        self._control[:] = actions[:, None]
+        # Unchecked: shapes are right by construction, and the checks cost as much as the rest of a step.
+        self._pool.rollout(
+            self._models, self._data, states, self._control, control_spec=_CONTROL,
+            skip_checks=True, nstep=self._frame_skip, state=self._substeps,
+        )  # fmt: skip
+        return self._substeps[:, -1].copy()
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._pool.close()
+
+
 class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """N lanes of a planar robot: Hopper-v5's observations and rewards, episodes of fixed length.
 
@@ -188,11 +243,13 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         env_spec: The environment; Hopper if not given.
         horizon: Control steps in an episode; the environment's own if None.
         nthread: Physics threads; as many as this process may use if None, none beside the
-            caller's if 0.
+            caller's if 0. Of "mujoco" only.
+        physics: "mujoco", on the processor's cores, or "warp", on a GPU (``trainer/warp.py``).
         terminate_when_unhealthy: End an episode on a fall, as Hopper-v5 does (for baselines).
 
     Raises:
         ValueError: If an option is out of range.
+        UserError: If the physics is not installed.
     """
 
     def __init__(
@@ -202,6 +259,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         env_spec: EnvSpec | None = None,
         horizon: int | None = None,
         nthread: int | None = None,
+        physics: str = "mujoco",
         terminate_when_unhealthy: bool = False,
     ) -> None:
         self.env_spec = env_spec or SPECS["hopper"]
@@ -222,14 +280,10 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             "render_fps": round(1 / self.dt),
         }
         self.model = physics_model(self.env_spec)
-        self._models = [self.model] * num_envs
-        self._data = [mujoco.MjData(self.model) for _ in range(max(nthread, 1))]
-        self._pool = rollout.Rollout(nthread=nthread)
+        self._physics = _make_physics(physics, self.model, self.env_spec.frame_skip, num_envs, nthread)
         self._initial = np.empty(mujoco.mj_stateSize(self.model, _FULL))
-        mujoco.mj_getState(self.model, self._data[0], self._initial, _FULL)
+        mujoco.mj_getState(self.model, mujoco.MjData(self.model), self._initial, _FULL)
         self._state = np.tile(self._initial, (num_envs, 1))
-        self._substeps = np.empty((num_envs, self.env_spec.frame_skip, self._initial.size))
-        self._control = np.empty((num_envs, self.env_spec.frame_skip, self.env_spec.action_size))
         self._positions = slice(1, 1 + self.model.nq)
         self._velocities = slice(1 + self.model.nq, None)
         self.elapsed = np.zeros(num_envs, np.int32)
@@ -310,13 +364,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if actions.shape != (self.num_envs, self.env_spec.action_size):
             raise ValueError(f"actions must be {self.action_space.shape}, got {actions.shape}")
         x_before = self._state[:, 1]
-        self._control[:] = actions[:, None]
-        # Unchecked: shapes are right by construction, and the checks cost as much as the rest of a step.
-        self._pool.rollout(
-            self._models, self._data, self._state, self._control, control_spec=_CONTROL,
-            skip_checks=True, nstep=self.env_spec.frame_skip, state=self._substeps,
-        )  # fmt: skip
-        self._state = self._substeps[:, -1].copy()
+        self._state = self._physics.step(self._state, actions)
         self.elapsed += 1
         qpos, qvel = self._state[:, self._positions], self._state[:, self._velocities]
         upright = healthy(self.env_spec, qpos, qvel)
@@ -388,8 +436,8 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.np_random.bit_generator.state = state["rng"]
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the physics threads."""
-        self._pool.close()
+        """Ends the physics: threads or device memory."""
+        self._physics.close()
 
     def _restart(self, lanes: np.ndarray) -> None:
         noise = self.env_spec.reset_noise
@@ -398,3 +446,13 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._state[lanes, 1:] += self.np_random.uniform(-noise, noise, size)
         self.elapsed[lanes] = 0
         self._limit[lanes] = self.horizon
+
+
+def _make_physics(kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> Physics:
+    if kind == "mujoco":
+        return RolloutPhysics(model, frame_skip, num_envs, nthread)
+    if kind == "warp":
+        from trainer.warp import WarpPhysics  # an optional extra, slow to import
+
+        return WarpPhysics(model, frame_skip, num_envs)
+    raise ValueError(f"physics must be 'mujoco' or 'warp', got {kind!r}")

@@ -145,7 +145,14 @@ class Learner:
         self._collector.load_state_dict(state["collector"])
 
     def _make_collector(self, lanes: int, *, seed: int, stagger: bool) -> Collector:
-        env = envs.make(self.config.env, lanes, horizon=self.demo_steps, nthread=self.config.rollouts.threads)
+        rollouts = self.config.rollouts
+        env = envs.make(
+            self.config.env,
+            lanes,
+            horizon=self.demo_steps,
+            nthread=rollouts.threads,
+            physics=rollouts.physics,
+        )
         return Collector(env, seed=seed, stagger=stagger)
 
 

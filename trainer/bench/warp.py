@@ -1,0 +1,94 @@
+"""Physics on a GPU: control steps/s of the ``warp`` backend beside the processor's, by lanes."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from trainer import envs
+from trainer.bench.figures import Growth, Result, Skipped, by_turns
+
+LANES = (512, 2048, 8192, 32768)
+_SPEC = envs.SPECS["hopper"]
+_CORES = len(os.sched_getaffinity(0))
+
+
+def measure(quick: bool = False) -> list[Result]:
+    """Steps/s of both backends for 512 to 32,768 lanes; skipped where there is no CUDA device.
+
+    Args:
+        quick: Up to 8,192 lanes and an eighth of the steps. The first run on a GPU compiles the kernels
+            besides.
+    """
+    if importlib.util.find_spec("mujoco_warp") is None:
+        return [Skipped(name="warp_lanes", reason="the extra 'warp' is not installed: not run")]
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    if not wp.is_cuda_available():
+        return [Skipped(name="warp_lanes", reason="no CUDA device on this machine: not run")]
+    if quick:
+        return [growth(LANES[:3], device=None, turns=2, lane_steps=2**16)]
+    return [growth(LANES, device=None, turns=3, lane_steps=2**19)]
+
+
+def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: int) -> Growth:
+    """Median control steps/s of both backends at each number of lanes, taken by turns.
+
+    The same states and actions; transfers to and from the device are part of the step. Hoppers
+    start upright and fall, as they do under an untrained policy.
+
+    Args:
+        lanes: Numbers of lanes, ascending.
+        device: Warp's name of a device; the first GPU if None.
+        turns: Repetitions of each side.
+        lane_steps: Control steps of a repetition, all lanes together.
+    """
+    from trainer.warp import WarpPhysics
+
+    model = envs.physics_model(_SPEC)
+    rates: dict[str, list[float]] = {}
+    where = ""
+    for count in lanes:
+        warp = WarpPhysics(model, _SPEC.frame_skip, count, device)
+        where = warp.device.name
+        sides: dict[str, envs.Physics] = {
+            "mujoco": envs.RolloutPhysics(model, _SPEC.frame_skip, count, _CORES),
+            "warp": warp,
+        }
+        steps = max(8, lane_steps // count)
+        runs = {name: _rate_of(physics, model.nu, count, steps) for name, physics in sides.items()}
+        taken = by_turns(runs, turns)
+        for name, values in taken.items():
+            rates.setdefault(name, []).append(statistics.median(values))
+            sides[name].close()
+    return Growth(
+        name="warp_lanes",
+        title=f"Physics by lanes: MuJoCo Warp on {where}, MuJoCo on {_CORES} cores",
+        x_label="lanes",
+        y_label="control steps/s",
+        x=list(lanes),
+        y=rates,
+    )
+
+
+def _rate_of(physics: envs.Physics, motors: int, lanes: int, steps: int) -> Callable[[], float]:
+    """A repetition: the lanes from their start for some steps, in control steps/s."""
+    rng = np.random.default_rng(0)
+    state = np.zeros((lanes, 13))
+    state[:, 2] = 1.25
+    state[:, 1:] += rng.uniform(-_SPEC.reset_noise, _SPEC.reset_noise, (lanes, 12))
+    actions = rng.uniform(-1, 1, (16, lanes, motors))
+
+    def run() -> float:
+        now, began = state, time.perf_counter()
+        for step in range(steps):
+            now = physics.step(now, actions[step % len(actions)])
+        return lanes * steps / (time.perf_counter() - began)
+
+    return run
