@@ -49,7 +49,7 @@ class PredictorConfig:
     """Of stochastic gradient descent with momentum 0.9."""
     weight_decay: float = 1e-4
     """L2 penalty."""
-    batch_clips: int = 30
+    batch_clips: int = 60
     """Clips in a batch."""
     pairs_per_clip: int = 4
     """(frame, state-action) pairs drawn from each of them."""
