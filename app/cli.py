@@ -112,6 +112,9 @@ def _parser() -> argparse.ArgumentParser:
     trpo.add_argument("--task", choices=("backflip", "hop"), default="backflip")
     trpo.add_argument("--steps", type=int, default=3_000_000, help="control steps (3 million)")
     trpo.add_argument("--seed", type=int, default=0)
+    trpo.add_argument("--lanes", type=int, default=64, help="episodes side by side (64)")
+    trpo.add_argument("--physics", choices=("mujoco", "warp"), default="mujoco")
+    trpo.add_argument("--device", default="cpu", metavar="NAME", help="of the policy: cpu (default) or cuda")
     trpo.add_argument(
         "--out",
         type=Path,
@@ -327,7 +330,16 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
 
     from trainer.baselines.handcoded import HandcodedConfig, save_result, train_handcoded
 
-    config = HandcodedConfig(task=arguments.task, steps=arguments.steps, seed=arguments.seed)
+    lanes = max(1, arguments.lanes)
+    config = HandcodedConfig(
+        task=arguments.task,
+        steps=arguments.steps,
+        seed=arguments.seed,
+        lanes=arguments.lanes,
+        batch=max(1, 32_000 // lanes),  # an iteration is as long however many lanes share it
+        physics=arguments.physics,
+        device=arguments.device,
+    )
     result = train_handcoded(config)
     save_result(arguments.out, result)
     for key, value in asdict(result.best_score).items():

@@ -13,12 +13,11 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import torch
 
 from trainer import envs
 from trainer.config import RunConfig
 from trainer.errors import UserError
-from trainer.policy import Policy, PolicySnapshot
+from trainer.policy import Policy, PolicySnapshot, check_device
 from trainer.predictor import FitStats, Snapshot, fit, visual_inputs
 from trainer.records import Segment
 from trainer.rollouts import Collector, Transitions
@@ -154,16 +153,6 @@ class Learner:
             physics=rollouts.physics,
         )
         return Collector(env, seed=seed, stagger=stagger)
-
-
-def check_device(device: str) -> None:
-    """Raises UserError if torch cannot compute there, with what it can use."""
-    if device == "cpu":
-        return
-    seen = [f"cuda:{n}" for n in range(torch.cuda.device_count())]
-    if torch.device(device).index not in (None, *range(len(seen))) or not seen:
-        there = ", ".join(["cpu", *seen])
-        raise UserError(f"device {device}: this PyTorch cannot use it; choose one of: {there}")
 
 
 def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:

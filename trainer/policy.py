@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from trainer.errors import UserError
 from trainer.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
 
 _CLIP = 10.0
@@ -303,6 +304,16 @@ class ValueFunction(nn.Module):
         self.return_std.copy_(std)
         self.updates.add_(1)
         return (returns - mean) / std
+
+
+def check_device(device: str) -> None:
+    """Raises UserError if torch cannot compute there, with what it can use."""
+    if device == "cpu":
+        return
+    seen = [f"cuda:{n}" for n in range(torch.cuda.device_count())]
+    if torch.device(device).index not in (None, *range(len(seen))) or not seen:
+        there = ", ".join(["cpu", *seen])
+        raise UserError(f"device {device}: this PyTorch cannot use it; choose one of: {there}")
 
 
 def mlp(sizes: Sequence[int], last_gain: float, seed: int) -> nn.Sequential:

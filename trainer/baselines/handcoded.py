@@ -28,7 +28,7 @@ from trainer.motion import (
     task_reward,
     until_fall,
 )
-from trainer.policy import Policy, PolicyConfig
+from trainer.policy import Policy, PolicyConfig, check_device
 from trainer.rollouts import Collector, Episodes, evaluate
 from trainer.trpo import Trpo, TrpoConfig
 
@@ -53,6 +53,10 @@ class HandcodedConfig:
     """Iterations between evaluations (16 deterministic episodes)."""
     threads: int = 2
     """Of the physics and of the learning. Any number gives the same numbers."""
+    physics: str = "mujoco"
+    """"mujoco" or "warp" (``rollouts.physics``)."""
+    device: str = "cpu"
+    """Where the policy is trained: "cpu", "cuda" or "cuda:N"."""
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="raw"))
     """Sees the observation alone: the rewards say nothing about time."""
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
@@ -111,7 +115,11 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
 
     Returns:
         Policies, learning curve and the best episode.
+
+    Raises:
+        UserError: If the device cannot be used or the physics is not installed.
     """
+    check_device(config.device)
     torch.set_num_threads(1)  # these networks are too small to gain from more
     # Hopping is learned as in Hopper-v5, where a fall ends the episode; a flip is no fall.
     env = envs.make(
@@ -119,6 +127,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         config.lanes,
         horizon=config.horizon,
         nthread=config.threads,
+        physics=config.physics,
         terminate_when_unhealthy=config.task == "hop",
     )
     policy = Policy(
@@ -127,7 +136,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         action_size=env.env_spec.action_size,
         horizon=config.horizon,
         seed=config.seed,
-    )
+    ).to(config.device)
     trpo = Trpo(policy, config.trpo, seed=config.seed, threads=config.threads)
     collector = Collector(env, seed=config.seed)
     reward = TASK_REWARDS[config.task]
@@ -138,7 +147,8 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     best: tuple[Score, dict, HiddenStates] | None = None
     with tqdm(total=iterations * per_iteration, unit="step", disable=not progress) as bar:
         for iteration in range(1, iterations + 1):
-            batch = collector.collect(policy.snapshot(), config.batch)
+            acting = policy.snapshot(on_device=config.device != "cpu")
+            batch = collector.collect(acting, config.batch)
             rewards = reward(batch.next_obs, batch.actions, batch.qpos, batch.next_qpos, batch.next_qvel)
             stats = trpo.update(batch, rewards)
             bar.update(per_iteration)

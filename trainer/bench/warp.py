@@ -11,7 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from trainer import envs
-from trainer.bench.figures import Growth, Result, Skipped, by_turns
+from trainer.baselines.handcoded import HandcodedConfig, train_handcoded
+from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
 
 LANES = (512, 2048, 8192, 32768)
 _SPEC = envs.SPECS["hopper"]
@@ -34,7 +35,30 @@ def measure(quick: bool = False) -> list[Result]:
         return [Skipped(name="warp_lanes", reason="no CUDA device on this machine: not run")]
     if quick:
         return [growth(LANES[:3], device=None, turns=2, lane_steps=2**16)]
-    return [growth(LANES, device=None, turns=3, lane_steps=2**19)]
+    return [growth(LANES, device=None, turns=3, lane_steps=2**19), whole_training(3_000_000, "cuda")]
+
+
+def whole_training(steps: int, device: str) -> Figure:
+    """The time of a whole backflip training, physics, policy and value function on the GPU.
+
+    Args:
+        steps: Control steps, all lanes together.
+        device: Of policy and value function.
+    """
+    lanes = 512
+    config = HandcodedConfig(
+        task="backflip", steps=steps, lanes=lanes, batch=32_768 // lanes, physics="warp", device=device,
+        evaluate_every=100,
+    )  # fmt: skip
+    began = time.perf_counter()
+    result = train_handcoded(config, progress=False)
+    score = result.curve[-1]
+    return single(
+        "gpu_backflip_s", f"a whole backflip training, {steps:,} steps, {device}",
+        [time.perf_counter() - began], unit="s",
+        how=f"TRPO on the hand-coded reward, {lanes} lanes; final policy: reward {score.reward_mean:,.0f}, "
+        f"{score.net_turns_mean:.1f} net turns; kernels were compiled before",
+    )  # fmt: skip
 
 
 def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: int) -> Growth:
