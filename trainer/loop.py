@@ -30,6 +30,7 @@ from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
+from trainer.priority import give_way
 from trainer.records import Demo, Segment, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Transitions
@@ -109,7 +110,7 @@ class Trainer:
         self._stop.clear()
         if self._status.phase == "stopped":
             self._tell("starting", "The run goes on from its last checkpoint.")
-        self._thread = threading.Thread(target=self.work, name="trainer", daemon=True)
+        self._thread = threading.Thread(target=self._run_thread, name="trainer", daemon=True)
         self._thread.start()
 
     def pause(self) -> None:
@@ -150,6 +151,10 @@ class Trainer:
         return self._policy
 
     # The thread
+
+    def _run_thread(self) -> None:
+        give_way()  # people at the page come first
+        self.work()
 
     def work(self) -> None:
         """Runs until done or stopped; a failure is shown in ``status`` and can be retried."""
