@@ -7,20 +7,12 @@ The real command runs as a child process; one light process plays the people at 
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import json
-import os
-import re
-import secrets
-import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
-import urllib.request
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 
@@ -29,84 +21,17 @@ from aiohttp import ClientSession
 
 from trainer.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
 from trainer.bench.figures import Figure, Result, Skipped, ratio, single
-from trainer.store import FILE_NAME, NewClip, Store
+from trainer.bench.serving import Server, Supply, annotator_link, check_counts, serving
+from trainer.store import Store
 
+CROWD = 50
+_EVERY_S = {1: 0.4, CROWD: 4.0}
+"""Seconds from press to press of each person, by how many they are; the one makes haste to give figures."""
 _PATIENCE_S = 120.0
 _IN_HAND = 2
 """Clips at each open page: one on screen, one fetched ahead."""
 _SPARE = 50
 """Clips beyond those, for the second until more are brought."""
-
-
-class Server:
-    """``onedemo serve`` on a data directory, until ``close``.
-
-    Args:
-        data_dir: Of the product.
-        settings: ``section.key=value``, as ``--set`` takes them; none for the defaults.
-
-    Raises:
-        RuntimeError: If it does not print its links.
-    """
-
-    def __init__(self, data_dir: Path, settings: Sequence[str] = ()) -> None:
-        self.data_dir = data_dir
-        self._log = data_dir.with_name(f"{data_dir.name}.err").open("w+")
-        # By name: what is measured here stands above the library, which imports nothing of it.
-        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
-        command += [word for setting in settings for word in ("--set", setting)]
-        self._child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, text=True)
-        assert self._child.stdout is not None
-        lines = [self._child.stdout.readline() for _ in range(2)]
-        self.links = dict(line.strip().split(": ", 1) for line in lines if line)
-        if len(self.links) != 2:
-            self.close()
-            self._log.seek(0)
-            raise RuntimeError(f"onedemo serve did not start: {self._log.read().strip()}")
-
-    @property
-    def base(self) -> str:
-        """Address of its front."""
-        return self.links["annotator"].split("/login")[0]
-
-    def phase(self) -> str:
-        """What the trainer does: "pretrain", "online", "paused", ..."""
-        with urllib.request.urlopen(f"{self.base}/healthz", timeout=10) as answer:
-            return json.load(answer)["phase"]
-
-    def peak_mib(self) -> float:
-        """The most memory the process has had at once, MiB (Linux)."""
-        status = Path(f"/proc/{self._child.pid}/status").read_text()
-        found = re.search(r"VmHWM:\s+(\d+) kB", status)
-        assert found is not None
-        return int(found[1]) / 1024
-
-    def rows(self, sql: str, *values: object) -> list[tuple]:
-        """What its database answers, on a read-only connection of our own."""
-        uri = f"{(self.data_dir / FILE_NAME).absolute().as_uri()}?mode=ro"
-        with closing(sqlite3.connect(uri, uri=True, timeout=10)) as db:
-            return db.execute(sql, values).fetchall()
-
-    def close(self) -> None:
-        """Ends the process as Ctrl-C would."""
-        self._child.terminate()
-        try:
-            self._child.wait(30)
-        except subprocess.TimeoutExpired:
-            self._child.kill()
-            self._child.wait()
-        assert self._child.stdout is not None
-        self._child.stdout.close()
-
-
-@contextmanager
-def serving(data_dir: Path, settings: Sequence[str] = ()) -> Iterator[Server]:
-    """A server for as long as the block lasts."""
-    server = Server(data_dir, settings)
-    try:
-        yield server
-    finally:
-        server.close()
 
 
 def measure(quick: bool) -> list[Result]:
@@ -115,15 +40,18 @@ def measure(quick: bool) -> list[Result]:
     Args:
         quick: Fewer ratings, turns and starts: under a minute instead of five.
     """
-    if not Path("/proc/self/status").exists():
-        return [Skipped("product", "the product is measured on Linux")]
-    results: list[Result] = [help_time(3 if quick else 9)]
+    if sys.platform != "linux":
+        return [Skipped(name="product", reason="memory and pages of a server are measured on Linux only")]
     with tempfile.TemporaryDirectory(prefix="onedemo-bench-") as place:
-        default = Path(place) / "default"
-        results += asyncio.run(default_run(default, quick=quick))
-        results.append(asyncio.run(start_time(default, 2 if quick else 5)))
-        results += asyncio.run(press_times(Path(place) / "press", quick=quick))
-    return results
+        data_dir = Path(place) / "data"
+        return [
+            help_time(3 if quick else 9),
+            *asyncio.run(default_run(data_dir, quick=quick)),
+            asyncio.run(start_time(data_dir, 1 if quick else 5)),
+            *asyncio.run(
+                press_times(data_dir, turns=2 if quick else 6, seconds=3.0 if quick else 10.0)
+            ),
+        ]  # fmt: skip
 
 
 def help_time(repetitions: int) -> Figure:
@@ -137,7 +65,7 @@ def help_time(repetitions: int) -> Figure:
 
 
 async def start_time(data_dir: Path, repetitions: int) -> Figure:
-    """A start on a data directory that has been used: links printed, page open, clip or waiting state shown."""
+    """A start on a data directory that has been used, until the page shows a clip or that it waits."""
     taken = []
     for _ in range(repetitions):
         began = time.perf_counter()
@@ -154,166 +82,104 @@ async def start_time(data_dir: Path, repetitions: int) -> Figure:
 
 
 async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
-    """Memory and the way of a rating, in the default run with a page on Rate and one on Watch."""
-    pretrain, online, iterations = (12, 6, 4) if quick else (200, 40, 12)
-    settings = [f"ratings.pretrain={pretrain}"] if quick else []
-    with serving(data_dir, settings) as server:
+    """Memory and the way of a rating, in the default run with a page on Rate and one on Watch.
+
+    Args:
+        data_dir: A new one.
+        quick: Few ratings before practice, few iterations.
+    """
+    pretrain, online, iterations = (12, 6, 3) if quick else (200, 40, 12)
+    with serving(data_dir, [f"ratings.pretrain={pretrain}"] if quick else []) as server:
         async with browser_session() as session:
             watch = await open_tab(session, server.links["researcher"])
             rate = await open_tab(session, server.links["annotator"])
             await _give(rate, pretrain)
-            await _reach(lambda: server.rows("SELECT COUNT(*) FROM iterations")[0][0] >= 1, "an iteration")
-            given = len(rate.presses)
+            await _reach(lambda: _iterations(server) >= 1, "an iteration")
             for _ in range(online):
-                await _give(rate, 1)
                 await asyncio.sleep(1.0)
-            last = rate.presses[-1]
-            await _reach(lambda: _delays(server, [last])[1], "a policy that knows the last rating")
-            await _reach(
-                lambda: server.rows("SELECT COUNT(*) FROM iterations")[0][0] >= iterations, "iterations"
-            )
-            delays = _delays(server, rate.presses[given:])
+                await _give(rate, 1)
+            practised = rate.presses[pretrain:]
+            await _reach(lambda: len(_delays(server, practised)[1]) == online, "a policy that knows all")
+            await _reach(lambda: _iterations(server) >= iterations, "iterations")
+            to_snapshot, to_policy = _delays(server, practised)
             check_counts(server, rate.presses)
             peak = server.peak_mib()
             await watch.close()
             await rate.close()
     how = f"default run, {pretrain} ratings before, one a second while it practises; a researcher watches"
     return [
-        single(
-            "rating_to_snapshot_s", "rating to a snapshot that knows it", delays[0], unit="s", reach=5, how=how
-        ),
-        single(
-            "rating_to_policy_s", "rating to a policy trained on it", delays[1], unit="s", reach=10, how=how
-        ),
-        single(
-            "peak_memory_mib", f"peak memory of serve: {pretrain} ratings, {iterations} iterations", [peak],
-            unit="MiB", reach=1.2 * 1024, how="VmHWM; one page on Rate, one on Watch; features made anew",
-        ),
+        single("rating_to_snapshot_s", "rating to a snapshot that knows it", to_snapshot, unit="s",
+               reach=5, how=how),
+        single("rating_to_policy_s", "rating to a policy trained on it", to_policy, unit="s",
+               reach=10, how=how),
+        single("peak_memory_mib", f"peak memory of serve, {iterations} iterations", [peak], unit="MiB",
+               reach=1.2 * 1024, how=f"VmHWM; {how}; the demo's features made anew"),
     ]  # fmt: skip
 
 
 async def press_times(
-    data_dir: Path, *, quick: bool, crowd: int = 50, turns: int | None = None, seconds: float | None = None
+    data_dir: Path, *, turns: int, seconds: float, every_s: dict[int, float] = _EVERY_S
 ) -> list[Result]:
-    """Key press to next clip for one annotator and for many, while the trainer runs and while it is paused.
+    """Key press to next clip, while the trainer runs and while it is paused.
 
     Args:
-        data_dir: A new one.
-        quick: Two short turns instead of six long ones.
-        crowd: How many the many are.
-        turns: Of each side, if not as ``quick`` says.
-        seconds: Of a turn, if not as ``quick`` says.
+        data_dir: A new one, or one that was used.
+        turns: Of each side.
+        seconds: Of a turn.
+        every_s: Seconds from press to press of each person, by how many they are, ascending.
+
+    Raises:
+        RuntimeError: If a press was lost or doubled.
     """
-    turns = turns or (2 if quick else 6)
-    seconds = seconds or (5.0 if quick else 12.0)
-    every = {1: 0.5, crowd: 4.0}
-    needed = sum(2 * turns * seconds * people / every_s for people, every_s in every.items())
+    needed = sum(2 * turns * seconds * people / pause for people, pause in every_s.items())
     # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
     settings = ["ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000"]
     results: list[Result] = []
     with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
+        before = store.last_event()
         async with browser_session() as session:
             tabs = [await open_tab(session, server.links["annotator"])]
             await _give(tabs[0], 10)
             await _bring(session, server, "paused")
-            await tabs[0].until(lambda: tabs[0].clip, "a clip")
-            supply = Supply(store, data_dir, int(1.2 * needed) + 2 * crowd * _IN_HAND)
-            for people, every_s in every.items():
-                supply.fill(people * _IN_HAND + _SPARE)
+            await _reach(lambda: tabs[0].clip, "a clip to rate")
+            supply = Supply(store, int(1.2 * needed) + sum(_IN_HAND * people + _SPARE for people in every_s))
+            for people, pause in every_s.items():
+                supply.fill(_IN_HAND * people + _SPARE)
                 for number in range(len(tabs), people):
-                    tabs.append(await open_tab(session, _link(server, store, f"annotator {number}")))
+                    link = annotator_link(server, store, f"annotator {number}")
+                    tabs.append(await open_tab(session, link))
                     await tabs[-1].until(lambda: tabs[-1].clip, "a clip")
-                filling = asyncio.create_task(supply.keep(people * _IN_HAND + _SPARE))
-                sides: dict[str, list[float]] = {"running": [], "paused": []}
+                filling = asyncio.create_task(supply.keep(_IN_HAND * people + _SPARE))
+                p95: dict[str, list[float]] = {"online": [], "paused": []}
                 for _ in range(turns):
-                    for phase, p95 in sides.items():
-                        await _bring(session, server, "online" if phase == "running" else "paused")
-                        given = [len(tab.presses) for tab in tabs]
-                        await rate_for(tabs, every_s=every_s, seconds=seconds)
-                        fresh = [p for tab, n in zip(tabs, given, strict=True) for p in tab.presses[n:]]
-                        p95.append(1000 * float(np.percentile([p.seconds for p in fresh], 95)))
+                    for phase, taken in p95.items():
+                        await _bring(session, server, phase)
+                        taken.append(await _percentile(tabs, pause, seconds))
                 filling.cancel()
-                results.append(
-                    ratio(
-                        f"press_{people}_annotator{'' if people == 1 else 's'}",
-                        f"key press to next clip, 95th percentile, {people} rating every {every_s:g} s, "
-                        "trainer running",
-                        ours=sides["running"],
-                        theirs=sides["paused"],
-                        against="trainer paused",
-                        unit="ms",
-                        reach=2,
-                        at_least=False,
-                        equal="same server and pages by turns; clips drawn before, as copies of a few; the"
-                        " clock stops when the next clip and its picture are there",
-                    )  # fmt: skip
-                )
-            check_counts(server, [press for tab in tabs for press in tab.presses])
+                results.append(_press_figure(people, pause, p95))
+            check_counts(server, [press for tab in tabs for press in tab.presses], after=before)
             for tab in tabs:
                 await tab.close()
     return results
 
 
-def check_counts(server: Server, presses: Sequence[Press]) -> None:
-    """Sees that each press is one rating in the database, and that there is no other.
-
-    Raises:
-        RuntimeError: If a rating was lost, doubled or changed.
-    """
-    pressed = Counter((press.clip, press.value) for press in presses)
-    events = Counter(server.rows("SELECT clip_id, value FROM events"))
-    if pressed != events:
-        raise RuntimeError(
-            f"{sum(pressed.values())} presses became {sum(events.values())} events: "
-            f"lost {dict(pressed - events)}, too many {dict(events - pressed)}"
-        )
+def _press_figure(people: int, pause: float, p95: dict[str, list[float]]) -> Figure:
+    name = f"press_{people}_annotator{'' if people == 1 else 's'}"
+    return ratio(
+        name, f"key press to next clip, 95th percentile, {people} rating every {pause:g} s, trainer running",
+        ours=p95["online"], theirs=p95["paused"], against="trainer paused", unit="ms", reach=2,
+        at_least=False,
+        equal="one server and its open pages by turns; clips drawn before, copies of a few; the clock stops "
+        "when the next clip and its picture are there",
+    )  # fmt: skip
 
 
-class Supply:
-    """Clips that wait to be rated: drawn ones once more, under numbers of their own.
-
-    Drawing takes a core 0.3 s a clip, so many people would wait for pictures and not for the page.
-
-    Args:
-        store: Of the server's data directory.
-        data_dir: That directory, with a run that has clips in it.
-        count: How many clips to make.
-    """
-
-    def __init__(self, store: Store, data_dir: Path, count: int) -> None:
-        self._store = store
-        self._run: str = store.runs()[-1]["id"]
-        drawn = store.waiting_clips(self._run)
-        pictures = data_dir / "runs" / self._run / "clips"
-        segments = {clip.id: store.segment(clip.id) for clip in drawn}
-        originals = [drawn[n % len(drawn)] for n in range(count)]
-        new = [
-            NewClip(demo_step=clip.demo_step, segment=segments[clip.id], stage="online", iteration=1)
-            for clip in originals
-        ]
-        added = [clip.id for clip in store.add_clips(self._run, new)]
-        for clip, original in zip(added, originals, strict=True):
-            os.link(pictures / f"{original.id:06d}.webp", pictures / f"{clip:06d}.webp")
-        self._left = added
-
-    def fill(self, queue: int) -> None:
-        """Lets so many clips wait to be rated.
-
-        Raises:
-            RuntimeError: If there are no more.
-        """
-        missing = queue - len(self._store.waiting_clips(self._run))
-        if missing > len(self._left):
-            raise RuntimeError("more clips were rated than were made")
-        if missing > 0:
-            self._store.set_clip_state(self._left[:missing], "ready")
-            del self._left[:missing]
-
-    async def keep(self, queue: int) -> None:
-        """Fills once a second until cancelled."""
-        while True:
-            await asyncio.to_thread(self.fill, queue)
-            await asyncio.sleep(1.0)
+async def _percentile(tabs: Sequence[Tab], pause: float, seconds: float) -> float:
+    """The 95th percentile of a turn, milliseconds."""
+    before = [len(tab.presses) for tab in tabs]
+    await rate_for(tabs, every_s=pause, seconds=seconds)
+    taken = [press.seconds for tab, n in zip(tabs, before, strict=True) for press in tab.presses[n:]]
+    return 1000 * float(np.percentile(taken, 95))
 
 
 async def _give(tab: Tab, count: int) -> None:
@@ -330,7 +196,7 @@ async def _bring(session: ClientSession, server: Server, phase: str) -> None:
     page = await open_tab(session, server.links["researcher"])
     await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
     await page.press("alt+P")
-    await _reach(lambda: server.phase() == phase, phase)
+    await _reach(lambda: server.phase() == phase, f"the phase {phase}")
     await page.close()
 
 
@@ -339,36 +205,30 @@ async def _reach(condition: Callable[[], object], what: str) -> None:
     while not await asyncio.to_thread(condition):
         if time.monotonic() > end:
             raise RuntimeError(f"waited {_PATIENCE_S:.0f} s in vain for {what}")
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(0.1)
+
+
+def _iterations(server: Server) -> int:
+    return server.rows("SELECT COUNT(*) FROM iterations")[0][0]
 
 
 def _delays(server: Server, presses: Sequence[Press]) -> tuple[list[float], list[float]]:
     """From each press to the first snapshot, and to the first finished iteration, that knows it, seconds.
 
-    Presses that nothing knows yet are left out.
+    The rows say themselves when they were written. Presses that nothing knows yet are left out.
     """
     event_of = dict(server.rows("SELECT clip_id, id FROM events WHERE kind = 'rate'"))
     snapshots = server.rows("SELECT number, last_event, created_at FROM snapshots ORDER BY number")
     iterations = server.rows("SELECT snapshot, created_at FROM iterations ORDER BY number")
-    known: tuple[list[float], list[float]] = [], []
+    to_snapshot, to_policy = [], []
     for press in presses:
-        fitted = next((s for s in snapshots if s[1] >= event_of[press.clip]), None)
-        if fitted is None:
-            continue
-        known[0].append(_seconds(fitted[2]) - press.at)
-        trained = next((created for snapshot, created in iterations if snapshot >= fitted[0]), None)
-        if trained is not None:
-            known[1].append(_seconds(trained) - press.at)
-    return known
+        event = event_of[press.clip]
+        fitted = [(number, written) for number, last_event, written in snapshots if last_event >= event]
+        trained = [written for snapshot, written in iterations if fitted and snapshot >= fitted[0][0]]
+        to_snapshot += [_time(written) - press.at for _, written in fitted[:1]]
+        to_policy += [_time(written) - press.at for written in trained[:1]]
+    return to_snapshot, to_policy
 
 
-def _seconds(created_at: str) -> float:
-    return datetime.fromisoformat(created_at.replace("Z", "+00:00")).timestamp()
-
-
-def _link(server: Server, store: Store, name: str) -> str:
-    """A link for an annotator of that name, as good as one that ``onedemo rater add`` prints."""
-    token = secrets.token_urlsafe(32)
-    rater = store.ensure_rater(name, "annotator")
-    store.add_token(hashlib.sha256(token.encode()).hexdigest(), rater.id, "link")
-    return f"{server.base}/login?token={token}"
+def _time(written: str) -> float:
+    return datetime.fromisoformat(written).timestamp()
