@@ -141,14 +141,18 @@ async def press_times(
             tabs = [await open_tab(session, server.links["annotator"])]
             await _give(tabs[0], 10)
             await _bring(session, server, "paused")
-            await _reach(lambda: tabs[0].clip, "a clip to rate")
-            supply = Supply(store, int(1.2 * needed) + sum(_IN_HAND * people + _SPARE for people in every_s))
+            run = store.runs()[-1]["id"]
+            await _reach(lambda: store.waiting_clips(run), "clips that are drawn")
+            supply = Supply(
+                store, run, int(1.2 * needed) + sum(_IN_HAND * people + _SPARE for people in every_s)
+            )
             for people, pause in every_s.items():
                 supply.fill(_IN_HAND * people + _SPARE)
                 for number in range(len(tabs), people):
                     link = annotator_link(server, store, f"annotator {number}")
                     tabs.append(await open_tab(session, link))
-                    await tabs[-1].until(lambda: tabs[-1].clip, "a clip")
+                for tab in tabs:
+                    await tab.until(lambda tab=tab: tab.clip, "a clip")
                 filling = asyncio.create_task(supply.keep(_IN_HAND * people + _SPARE))
                 p95: dict[str, list[float]] = {"online": [], "paused": []}
                 for _ in range(turns):

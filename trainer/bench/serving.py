@@ -101,13 +101,13 @@ class Supply:
     not for the page.
 
     Args:
-        store: Of the server's data directory. Its newest run must have drawn clips that wait.
+        store: Of the server's data directory.
+        run: The run that is served; drawn clips of it must wait.
         count: How many clips to make.
     """
 
-    def __init__(self, store: Store, count: int) -> None:
-        self._store = store
-        self._run: str = store.runs()[-1]["id"]
+    def __init__(self, store: Store, run: str, count: int) -> None:
+        self._store, self._run = store, run
         drawn = store.waiting_clips(self._run)
         pictures = store.path.parent / "runs" / self._run / "clips"
         segments = {clip.id: store.segment(clip.id) for clip in drawn}
