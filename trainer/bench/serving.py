@@ -26,7 +26,8 @@ class Server:
 
     Args:
         data_dir: Of the product.
-        settings: ``section.key=value``, as ``--set`` takes them; none for the defaults.
+        settings: ``section.key=value``, as ``--set`` takes them, for a new run; none to go on with the
+            newest run, or to make one with the defaults.
 
     Raises:
         RuntimeError: If it does not print its links.
@@ -38,6 +39,7 @@ class Server:
         # By name: what is measured stands above this package, which imports nothing of it.
         command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
         command += [word for setting in settings for word in ("--set", setting)]
+        command += ["--new-run"] if settings else []
         self._child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, text=True)
         assert self._child.stdout is not None
         lines = [self._child.stdout.readline() for _ in range(2)]
