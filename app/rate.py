@@ -41,8 +41,9 @@ class Rate:
         self._status: Status = trainer.status()
         self._problem = ""
         self._shown = False
-        self._commands: list[Any] = []
-        self._keys_for: tuple | None = None
+        self._clip_keys: list[Any] = []
+        self._undo_keys: list[Any] = []
+        self._keys_for: int | None = None
         gui = session.client.gui
         self._top = gui.add_html("")
         self._stage = gui.add_html("")
@@ -128,31 +129,37 @@ class Rate:
             handle.content = content
 
     def _set_keys(self, clip: int | None) -> None:
-        wanted = (clip, self._desk.can_undo)
-        if wanted == self._keys_for:
-            return
-        self._remove_keys()
-        if clip is not None:
-            if self._slider.value != _MIDDLE:
-                self._slider.value = _MIDDLE
-            for value, answer in enumerate(ANSWERS, start=1):
-                self._key(f"{value}: {answer}", str(value), partial(self._desk.rate, clip, value))
-            self._key("Skip this one", "S", partial(self._desk.skip, clip))
-        if self._desk.can_undo:
-            self._key("Take the last one back", "U", self._desk.undo)
-            self._key("Take the last one back", "backspace", self._desk.undo)
-        self._keys_for = wanted
+        if clip != self._keys_for:
+            _remove(self._clip_keys)
+            if clip is not None:
+                if self._slider.value != _MIDDLE:
+                    self._slider.value = _MIDDLE
+                for value, answer in enumerate(ANSWERS, start=1):
+                    action = partial(self._desk.rate, clip, value)
+                    self._clip_keys.append(self._key(f"{value}: {answer}", str(value), action))
+                self._clip_keys.append(self._key("Skip this one", "S", partial(self._desk.skip, clip)))
+            self._keys_for = clip
+        if self._desk.can_undo != bool(self._undo_keys):
+            _remove(self._undo_keys)
+            if self._desk.can_undo:
+                for hotkey in ("U", "backspace"):
+                    self._undo_keys.append(self._key("Take the last one back", hotkey, self._desk.undo))
 
-    def _key(self, label: str, hotkey: Any, action: Any) -> None:
+    def _key(self, label: str, hotkey: Any, action: Any) -> Any:
         command = self._client.gui.add_command(label, hotkey=hotkey)
         command.on_trigger(lambda _: self._press(action))
-        self._commands.append(command)
+        return command
 
     def _remove_keys(self) -> None:
-        for command in self._commands:
-            command.remove()
-        self._commands.clear()
+        _remove(self._clip_keys)
+        _remove(self._undo_keys)
         self._keys_for = None
+
+
+def _remove(commands: list[Any]) -> None:
+    for command in commands:
+        command.remove()
+    commands.clear()
 
 
 _SUBMIT = (

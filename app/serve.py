@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sys
 import threading
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from trainer.records import Demo
 from trainer.render import RenderThread
 from trainer.runs import add_run, find_run
 from trainer.store import Store
+
+_SWITCH_SECONDS = 0.0005
+"""A press passes through five threads. Each would wait Python's usual 5 ms for a trainer that computes."""
 
 
 def serve(
@@ -51,6 +55,7 @@ def serve(
         UserError: If the data directory, the port or the graphics library cannot be used.
     """
     check_port(host, port)
+    sys.setswitchinterval(_SWITCH_SECONDS)
     store = Store(data_dir)
     renderer = RenderThread()
     secret = read_secret(data_dir)

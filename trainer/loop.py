@@ -30,6 +30,7 @@ from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
+from trainer.priority import give_way
 from trainer.records import Demo, Segment, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Transitions
@@ -111,7 +112,7 @@ class Trainer:
         self._stop.clear()
         if self._status.phase == "stopped":
             self._tell("starting", "The run goes on from its last checkpoint.")
-        self._thread = threading.Thread(target=self.work, name="trainer", daemon=True)
+        self._thread = threading.Thread(target=self._run_thread, name="trainer", daemon=True)
         self._thread.start()
 
     def pause(self) -> None:
@@ -152,6 +153,10 @@ class Trainer:
         return self._policy
 
     # The thread
+
+    def _run_thread(self) -> None:
+        give_way()  # people at the page come first
+        self.work()
 
     def work(self) -> None:
         """Runs until done or stopped; a failure is shown in ``status`` and can be retried."""
@@ -248,7 +253,11 @@ class Trainer:
         if not ratings:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
-        snapshot, stats = learner.fit(ratings, number)
+        torch.set_num_threads(1)  # The matrices of a fit are small: two threads would wait for each other.
+        try:
+            snapshot, stats = learner.fit(ratings, number)
+        finally:
+            torch.set_num_threads(self.config.rollouts.threads)
         snapshot.save(self._snapshot_file(number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event

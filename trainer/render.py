@@ -24,6 +24,7 @@ import numpy as np
 
 from trainer.backdrop import Camera, backdrop
 from trainer.gl import open_context
+from trainer.priority import give_way
 
 WIDTH, HEIGHT = 480, 360
 """Size of one side of a clip, pixels."""
@@ -203,6 +204,7 @@ class RenderThread:
         self.close()
 
     def _work(self, width: int, height: int, started: Future[None]) -> None:
+        give_way()  # before the driver starts threads of its own
         try:
             renderer = Renderer(width, height)
         except BaseException as error:

@@ -1,0 +1,58 @@
+"""The bench of the product on a small scale: a real server, people who rate at it, every press counted."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from dataclasses import replace
+
+import pytest
+
+from trainer.bench import product
+from trainer.bench.annotators import Press, browser_session, open_tab
+from trainer.bench.serving import Server, check_counts
+
+pytestmark = pytest.mark.seam
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory):
+    """Shared, so that the demo is looked at once."""
+    return tmp_path_factory.mktemp("bench") / "data"
+
+
+def test_presses_are_timed_and_counted(data_dir):
+    # Raises if a press is lost or doubled.
+    figures = asyncio.run(product.press_times(data_dir, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}))
+    assert [figure.name for figure in figures] == ["press_1_annotator", "press_4_annotators"]
+    for figure in figures:
+        assert math.isfinite(figure.value) and figure.reach == 2 and not figure.at_least
+        assert all(0 < p95 < 20_000 for side in figure.sides.values() for p95 in side)
+
+
+def test_lost_doubled_and_changed_ratings_are_noticed(data_dir):
+    async def rate_three(server: Server) -> list[Press]:
+        async with browser_session() as session:
+            tab = await open_tab(session, server.links["annotator"])
+            await product._give(tab, 3)
+            await tab.close()
+            return tab.presses
+
+    with product.serving(data_dir) as server:
+        ((before,),) = server.rows("SELECT IFNULL(MAX(id), 0) FROM events")
+        presses = asyncio.run(rate_three(server))
+        check_counts(server, presses, after=before)
+        changed = replace(presses[0], value=presses[0].value % 5 + 1)
+        for wrong in (presses[1:], [*presses, presses[0]], [changed, *presses[1:]]):
+            with pytest.raises(RuntimeError, match=f"{len(wrong)} presses became 3 events"):
+                check_counts(server, wrong, after=before)
+        assert 50 < server.peak_mib() < 4000
+
+
+def test_start_is_timed_until_the_page_shows_something(data_dir):
+    assert 0 < asyncio.run(product.start_time(data_dir, 1)).value < 60
+
+
+def test_server_that_cannot_start_says_why(data_dir):
+    with pytest.raises(RuntimeError, match="unknown key 'nonsense'"):
+        Server(data_dir, ["nonsense=1"])
