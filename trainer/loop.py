@@ -253,11 +253,7 @@ class Trainer:
         if not ratings:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
-        torch.set_num_threads(1)  # The matrices of a fit are small: two threads would wait for each other.
-        try:
-            snapshot, stats = learner.fit(ratings, number)
-        finally:
-            torch.set_num_threads(self.config.rollouts.threads)
+        snapshot, stats = learner.fit(ratings, number)
         snapshot.save(self._snapshot_file(number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
