@@ -64,15 +64,19 @@ def test_conjugate_gradient_solves_a_dense_system():
     matrix = root @ root.T + torch.eye(20, dtype=torch.float64)
     b = torch.randn(20, generator=generator, dtype=torch.float64)
     exact = torch.linalg.solve(matrix, b)
-    torch.testing.assert_close(conjugate_gradient(lambda v: matrix @ v, b, 40), exact)
+    solved, left = conjugate_gradient(lambda v: matrix @ v, b, 40)
+    torch.testing.assert_close(solved, exact)
+    for n in (1, 3):
+        x, left = conjugate_gradient(lambda v: matrix @ v, b, n)
+        torch.testing.assert_close(left, b - matrix @ x)
     # Each iteration brings the energy norm down, and two are not enough.
     errors = []
     for n in (1, 2, 5, 10):
-        error = conjugate_gradient(lambda v: matrix @ v, b, n) - exact
+        error = conjugate_gradient(lambda v: matrix @ v, b, n)[0] - exact
         errors.append((error @ matrix @ error).item())
     assert errors == sorted(errors, reverse=True)
     assert errors[1] > 1e-3
-    zero = conjugate_gradient(lambda v: matrix @ v, torch.zeros_like(b), 5)
+    zero, _ = conjugate_gradient(lambda v: matrix @ v, torch.zeros_like(b), 5)
     assert not zero.any(), "no gradient, no direction"
 
 
@@ -106,6 +110,15 @@ def test_fisher_product_is_the_dense_fisher_matrix():
     product = fisher_product(policy, inputs, damping=0.1)
     columns = torch.stack([product(v) for v in torch.eye(count + 2, dtype=torch.float64)])
     torch.testing.assert_close(columns, fisher + 0.1 * torch.eye(count + 2, dtype=torch.float64))
+
+
+def test_fisher_product_does_not_depend_on_how_the_samples_are_cut(monkeypatch):
+    policy = small_policy().double()
+    inputs = torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    vector = torch.arange(parameters(policy).numel(), dtype=torch.float64)
+    whole = fisher_product(policy, inputs, damping=0.1)(vector)
+    monkeypatch.setattr("trainer.fisher._CHUNK", 7)
+    torch.testing.assert_close(fisher_product(policy, inputs, damping=0.1)(vector), whole)
 
 
 def made_up_rollouts(policy, lanes=8, steps=100, seed=0):

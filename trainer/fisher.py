@@ -18,7 +18,7 @@ def conjugate_gradient(
     b: torch.Tensor,
     iterations: int,
     tolerance: float = 1e-10,
-) -> torch.Tensor:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Solves A x = b for a symmetric positive definite A (Hestenes and Stiefel 1952).
 
     Args:
@@ -28,7 +28,7 @@ def conjugate_gradient(
         tolerance: Stop when the squared residual is below this.
 
     Returns:
-        x, (P,).
+        x and what is left of b, b - A x: both (P,).
     """
     x, residual, direction = torch.zeros_like(b), b.clone(), b.clone()
     square = residual @ residual
@@ -41,7 +41,7 @@ def conjugate_gradient(
         residual -= length * image
         square, previous = residual @ residual, square
         direction = residual + square / previous * direction
-    return x
+    return x, residual
 
 
 def mean_kl(
@@ -81,30 +81,52 @@ def fisher_product(
         damping: Added to the diagonal.
     """
     layers = [layer for layer in policy.mean if isinstance(layer, nn.Linear)]
-    weights = [layer.weight.detach().clone() for layer in layers]
     shapes = [shape for layer in layers for shape in (layer.weight.shape, layer.bias.shape)]
     sizes = [shape.numel() for shape in shapes]
+    weights = [layer.weight.detach().clone() for layer in layers]
     precision_a = torch.exp(-2 * policy.log_std.detach()) / len(inputs_Bf)
-    activations, slopes = [inputs_Bf], []
-    for layer in layers[:-1]:
-        activations.append(torch.tanh(layer(activations[-1])).detach())
-        slopes.append(1 - activations[-1].square())
+    passes = [_passes(policy.mean, weights, precision_a, inputs) for inputs in inputs_Bf.split(_CHUNK)]
 
     def product(v_P: torch.Tensor) -> torch.Tensor:
         parts = v_P.split([*sizes, len(precision_a)])
         steps = [part.view(shape) for part, shape in zip(parts[:-1], shapes, strict=True)]
+        out_P = damping * v_P
+        out_P[-len(precision_a) :] += 2 * parts[-1]
+        for through in passes:
+            out_P[: -len(precision_a)] += through(steps)
+        return out_P
+
+    return product
+
+
+_CHUNK = 2048
+"""Samples at a time: what lies between two layers then stays in a core's cache."""
+
+
+def _passes(
+    network: nn.Module, weights: list[torch.Tensor], precision_a: torch.Tensor, inputs_Bf: torch.Tensor
+) -> Callable[[list[torch.Tensor]], torch.Tensor]:
+    """The function v -> J^T S^-1 J v over some samples, for the parameters of the mean."""
+    x, activations, slopes = inputs_Bf, [inputs_Bf], []
+    with torch.no_grad():
+        for layer in list(network.children())[:-1]:
+            x = layer(x)
+            if not isinstance(layer, nn.Linear):  # after the tanh
+                activations.append(x)
+                slopes.append(1 - x.square())
+
+    def through(steps: list[torch.Tensor]) -> torch.Tensor:
         tangent = torch.addmm(steps[1], activations[0], steps[0].T)
-        for i in range(1, len(layers)):
+        for i in range(1, len(weights)):
             tangent.mul_(slopes[i - 1])
-            tangent = torch.addmm(steps[2 * i + 1], tangent, weights[i].T).addmm_(
-                activations[i], steps[2 * i].T
-            )
-        grads: list[torch.Tensor] = [2 * parts[-1]]
+            tangent = torch.addmm(steps[2 * i + 1], tangent, weights[i].T)
+            tangent.addmm_(activations[i], steps[2 * i].T)
         back = tangent * precision_a
-        for i in range(len(layers) - 1, -1, -1):
+        grads: list[torch.Tensor] = []
+        for i in range(len(weights) - 1, -1, -1):
             grads[:0] = [(back.T @ activations[i]).reshape(-1), back.sum(0)]
             if i:
                 back = (back @ weights[i]).mul_(slopes[i - 1])
-        return torch.cat(grads).add_(v_P, alpha=damping)
+        return torch.cat(grads)
 
-    return product
+    return through

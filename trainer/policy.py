@@ -332,5 +332,30 @@ def mlp(sizes: Sequence[int], last_gain: float, seed: int) -> nn.Sequential:
         gain = last_gain if last else math.sqrt(2)
         nn.init.orthogonal_(layer.weight, gain, generator)
         nn.init.zeros_(layer.bias)
-        layers += [layer] if last else [layer, nn.Tanh()]
+        layers += [layer] if last else [layer, Tanh()]
     return nn.Sequential(*layers)
+
+
+class Tanh(nn.Module):
+    """Hyperbolic tangent; on the processor NumPy's, which is ten times as fast as PyTorch 2.13's.
+
+    It took half of the time of a pass through these networks. Can be differentiated once.
+    """
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Of any shape, float32 or float64."""
+        return torch.tanh(x) if x.device.type != "cpu" else _NumpyTanh.apply(x)  # type: ignore[no-any-return]
+
+
+class _NumpyTanh(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        y = torch.from_numpy(np.tanh(x.detach().numpy()))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        (y,) = ctx.saved_tensors
+        return torch.ops.aten.tanh_backward(grad, y)

@@ -225,8 +225,8 @@ class Trpo:
         gradient_P = _flat(torch.autograd.grad(before, self._parameters))
         with torch.no_grad():
             fisher = fisher_product(policy, inputs_Bf[sample], config.damping)
-            direction_P = conjugate_gradient(fisher, gradient_P, config.cg_iterations)
-            curvature = direction_P @ fisher(direction_P)
+            direction_P, left_P = conjugate_gradient(fisher, gradient_P, config.cg_iterations)
+            curvature = direction_P @ (gradient_P - left_P)  # d F d, as F d is known by now
             if not torch.isfinite(curvature) or curvature <= 0:  # no gradient: nothing to improve
                 return False, 0, 0.0, 0.0
             step_P = direction_P * torch.sqrt(2 * config.max_kl / curvature)

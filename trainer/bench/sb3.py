@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -15,7 +17,7 @@ import torch
 from sb3_contrib import TRPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from trainer import envs
+from trainer import envs, profiling
 from trainer.bench.figures import Result, by_turns, ratio
 from trainer.bench.physics import cores
 from trainer.bench.training import LANES, STEPS, one_thread
@@ -35,7 +37,7 @@ def _measure(quick: bool) -> list[Result]:
     config = TrpoConfig(fisher_samples=batch // 2)
     best, tried = best_of_stock_envs(config, batch, quick)
     ours = _Ours(config)
-    theirs = Theirs(config, batch, best.make, best.threads)
+    theirs = Theirs(config, batch, best.make, best.threads, shipped=True)
     same = Theirs(config, batch, lambda: OursAsVecEnv(LANES), best.threads)
     rates = by_turns({"ours": ours.run, "best": theirs.run, "same": same.run}, 2 if quick else 9)
     for side in (ours, theirs, same):
@@ -83,7 +85,7 @@ def best_of_stock_envs(config: TrpoConfig, batch: int, quick: bool) -> tuple[Sto
     for name, kind, count in kinds:
         for threads in sorted({1} if quick else {1, cores()}):
             make = _maker(kind, count)
-            theirs = Theirs(config, batch if not quick else batch // 4, make, threads)
+            theirs = Theirs(config, batch if not quick else batch // 4, make, threads, shipped=True)
             rate = max(theirs.run() for _ in range(1 if quick else 2))
             theirs.close()
             tried.append(
@@ -100,6 +102,9 @@ def _maker(kind: Any, count: int) -> Callable[[], VecEnv]:
 
 
 def _hopper() -> gymnasium.Env:
+    # In a process of its own, importing this module has switched profiling off: as shipped, it is on.
+    if multiprocessing.parent_process() is not None:
+        profiling.as_shipped().__enter__()
     return gymnasium.make("Hopper-v5")
 
 
@@ -111,12 +116,23 @@ class Theirs:
         batch: Control steps of an iteration, all lanes together.
         make: Makes the environment.
         threads: Of torch while it learns.
+        shipped: With MuJoCo's profiling on, as its Python package has it.
     """
 
-    def __init__(self, config: TrpoConfig, batch: int, make: Callable[[], VecEnv], threads: int) -> None:
+    def __init__(
+        self,
+        config: TrpoConfig,
+        batch: int,
+        make: Callable[[], VecEnv],
+        threads: int,
+        *,
+        shipped: bool = False,
+    ) -> None:
         # A last minibatch that is smaller than the others: ours has it, too.
         warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-        env = make()
+        self._profiling = profiling.as_shipped if shipped else nullcontext
+        with self._profiling():
+            env = make()
         self._batch, self._threads = batch // env.num_envs * env.num_envs, threads
         self._model = TRPO(
             "MlpPolicy",
@@ -143,7 +159,8 @@ class Theirs:
         before = torch.get_num_threads()
         torch.set_num_threads(self._threads)
         began = time.perf_counter()
-        self._model.learn(self._batch, reset_num_timesteps=False)
+        with self._profiling():
+            self._model.learn(self._batch, reset_num_timesteps=False)
         seconds = time.perf_counter() - began
         torch.set_num_threads(before)
         return self._batch / seconds
