@@ -24,12 +24,17 @@ def switch_off() -> None:
         callback.value = None
 
 
-@contextmanager
-def as_shipped() -> Iterator[None]:
-    """With profiling as the Python package has it: for programs that onedemo is compared with."""
+def switch_on() -> None:
+    """Profiling as the Python package has it: for programs that onedemo is compared with."""
     callback, shipped = _global()
     if callback is not None:
         callback.value = shipped
+
+
+@contextmanager
+def as_shipped() -> Iterator[None]:
+    """Profiling as the Python package has it, for a while."""
+    switch_on()
     try:
         yield
     finally:

@@ -218,41 +218,22 @@ def _demo_length(place: Path, seconds: tuple[int, ...]) -> Growth:
             lines.setdefault(line, []).append(cost)
     return Growth(
         name="demo_length", title="A longer demonstration", x_label="length of the demo, s",
-        y_label="s; memory: GiB", x=seconds, y=lines,
+        y_label="seconds", x=seconds, y=lines,
     )  # fmt: skip
 
 
 def _costs(demo: Demo, encoder: EfficientNetLite0, place: Path) -> dict[str, float]:
     costs: dict[str, float] = {}
-    features, costs["features"], memory = _cost(lambda: demo_features(demo, encoder, place))
-    _, costs["features from the cache"], _ = _cost(lambda: demo_features(demo, encoder, place))
+    features, costs["features"] = _timed(lambda: demo_features(demo, encoder, place))
+    _, costs["features from the cache"] = _timed(lambda: demo_features(demo, encoder, place))
     dims = PredictorConfig().visual_dims
-    _, costs["predictor's inputs"], _ = _cost(lambda: visual_inputs(features, dims))
-    _, costs["all frames read"], whole = _cost(lambda: read_frames(demo))
-    if memory is not None and whole is not None:
-        costs["memory of features, GiB"], costs["memory of all frames, GiB"] = memory, whole
+    _, costs["predictor's inputs"] = _timed(lambda: visual_inputs(features, dims))
+    _, costs["all frames read"] = _timed(lambda: read_frames(demo))
     return costs
 
 
-def _cost(job: Callable[[], T]) -> tuple[T, float, float | None]:
-    """What the job gives, the seconds it takes, and by how many GiB the process grows (None: not told)."""
-    before = _reset_peak()
+def _timed(job: Callable[[], T]) -> tuple[T, float]:
+    """What the job gives, and the seconds it takes."""
     began = time.perf_counter()
     result = job()
-    took = time.perf_counter() - began
-    # Memory that was free before is used first: never nothing, for the chart's logarithm.
-    grown = None if before is None else max(_memory("VmHWM") - before, 1e-3)
-    return result, took, grown
-
-
-def _reset_peak() -> float | None:
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-        return _memory("VmRSS")
-    except OSError:  # not on Linux
-        return None
-
-
-def _memory(key: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(key)) / 2**20
+    return result, time.perf_counter() - began
