@@ -60,7 +60,7 @@ class Growth:
     y: Mapping[str, Sequence[float]]
     """Cost at each size, by the name of the line."""
     log: bool = True
-    """Whether both axes are logarithmic."""
+    """Whether the axes are logarithmic; that of the cost is so only if it grows tenfold."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -170,7 +170,7 @@ async def press_times(
 def _press_figure(people: int, pause: float, p95: dict[str, list[float]]) -> Figure:
     name = f"press_{people}_annotator{'' if people == 1 else 's'}"
     return ratio(
-        name, f"key press to next clip, 95th percentile, {people} rating every {pause:g} s, trainer running",
+        name, f"key press to next clip, 95th percentile, people rating: {people}, each every {pause:g} s",
         ours=p95["online"], theirs=p95["paused"], against="trainer paused", unit="ms", reach=2,
         at_least=False,
         equal="one server and its open pages by turns; clips drawn before, copies of a few; the clock stops "

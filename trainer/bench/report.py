@@ -133,9 +133,10 @@ def _html(title: str, results: Sequence[Result], about: dict[str, Any], charts: 
     notes |= {s.name: f"not run, {s.reason}" for s in results if isinstance(s, Skipped)}
     items = "".join(f"<li><b>{name}</b>: {html.escape(note)}" for name, note in notes.items())
     pictures = "".join(f'<img src="{file}" alt="{html.escape(growth.title)}">' for growth, file in charts)
+    facts = html.escape(_facts(about).replace("`", ""))
     return (
         f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title>"
-        f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><p>{html.escape(_facts(about))}</p>"
+        f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1><p>{facts}</p>"
         f"<table><thead>{cells('th', _HEADS)}</thead><tbody>{''.join(cells('td', r) for r in _rows(results))}"
         f"</tbody></table><section>{pictures}</section><h2>How it was measured</h2><ul>{items}</ul></html>\n"
     )
@@ -145,11 +146,13 @@ _STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:70rem;margin:3rem auto;padding:0 1.5rem;color:#1c2430}"
     "h1{font-size:1.6rem}table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums}"
     "th,td{text-align:left;padding:.4rem .8rem .4rem 0;border-bottom:1px solid #e3e7ed;vertical-align:top}"
+    "td:nth-child(n+3){white-space:nowrap}"
     "section{display:flex;flex-wrap:wrap;gap:1rem;margin:2rem 0}img{width:22rem;max-width:100%}"
     "li{margin:.4rem 0;font-size:.85rem;color:#566173}"
 )
 
 
+_MOST_TICKS = 6
 _COLOURS = ("#2f5dc4", "#e0902f", "#0d8a72", "#9a4fb5")
 
 
@@ -165,9 +168,14 @@ def _draw(growth: Growth, file: Path) -> None:
         axes.plot(growth.x, values, marker="o", markersize=3.5, linewidth=1.8, color=colour, label=name)
     if growth.log:
         axes.set_xscale("log")
+        every = -(-len(growth.x) // _MOST_TICKS)
+        axes.set_xticks(growth.x[::every], labels=[_short(x) for x in growth.x[::every]])
+        axes.minorticks_off()
+    values = [value for line in growth.y.values() for value in line]
+    if growth.log and max(values) > 10 * min(values):
         axes.set_yscale("log")
-    else:
-        axes.set_ylim(bottom=0)
+    else:  # less than a decade: a logarithm would make much of little
+        axes.set_ylim(0, 1.3 * max(values))
     axes.set(title=growth.title, xlabel=growth.x_label, ylabel=growth.y_label)
     axes.grid(alpha=0.25, which="both", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
@@ -175,6 +183,13 @@ def _draw(growth: Growth, file: Path) -> None:
         axes.legend(frameon=False, fontsize=8)
     figure.savefig(file, metadata={"Date": None})
     pyplot.close(figure)
+
+
+def _short(size: float) -> str:
+    for unit, name in ((1e6, "M"), (1e3, "k")):
+        if size >= unit:
+            return f"{size / unit:g}{name}"
+    return f"{size:g}"
 
 
 def _facts(about: dict[str, Any]) -> str:
