@@ -143,7 +143,7 @@ def _rate(step: Callable[[np.ndarray], object], actions: np.ndarray) -> float:
 
 def _against_envpool(turns: int, steps: int) -> list[Result]:
     try:
-        import envpool
+        import envpool  # pyright: ignore[reportMissingImports]
     except ImportError:
         return [
             Skipped(name="physics_vs_envpool", reason="envpool is not installed: pip install -e '.[bench]'")

@@ -14,8 +14,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from sb3_contrib import TRPO
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from sb3_contrib import TRPO  # pyright: ignore[reportMissingImports]
+from stable_baselines3.common.vec_env import (  # pyright: ignore[reportMissingImports]
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+)
 
 from trainer import envs, profiling
 from trainer.bench.figures import Result, by_turns, ratio
