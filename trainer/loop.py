@@ -199,6 +199,9 @@ class Trainer:
         self._tell("stopped", "The run is stopped. It can be started again where it was.")
 
     def _prepare(self) -> Learner:
+        # The networks that learn are too small to be split: threads would wait for each other more than
+        # they compute, the longer the busier the machine. Their first weights depend on the number, too.
+        torch.set_num_threads(1)
         learner = Learner(self.config, self.demo.frames, self.demo.fps)
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
@@ -219,8 +222,6 @@ class Trainer:
             self._ask(learner)  # people rate while the encoder looks at the demo, seconds the first time
         torch.set_num_threads(self.config.rollouts.threads)
         learner.look_at(demo_features(self.demo, self._encoder, self.data_dir / "demos"))
-        # The networks that learn are too small to be split: threads would wait for each other more than
-        # they compute, the longer the busier the machine.
         torch.set_num_threads(1)
         return learner
 
