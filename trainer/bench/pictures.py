@@ -65,7 +65,7 @@ def measure(quick: bool, *, seconds: tuple[int, ...] | None = None) -> list[Resu
         place = Path(directory)
         return [
             _render(turns=3 if quick else 12),
-            *_features(turns=5 if quick else 10),
+            *_features(turns=3 if quick else 10),
             _cached(place, turns=2 if quick else 5),
             _demo_length(place, seconds),
         ]

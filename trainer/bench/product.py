@@ -49,7 +49,7 @@ def measure(quick: bool) -> list[Result]:
             *asyncio.run(default_run(data_dir, quick=quick)),
             asyncio.run(start_time(data_dir, 1 if quick else 5)),
             *asyncio.run(
-                press_times(data_dir, turns=2 if quick else 6, seconds=2.0 if quick else 10.0)
+                press_times(data_dir, turns=2 if quick else 6, seconds=1.2 if quick else 10.0)
             ),
         ]  # fmt: skip
 
