@@ -134,7 +134,7 @@ def physics_model(env_spec: EnvSpec) -> mujoco.MjModel:
     """The robot's model as it is stepped.
 
     One robot is one island of constraints: looking for islands is switched off, which changes no bit
-    of what comes out and saves a twelfth of the time.
+    of what comes out and makes physics 1.08 times as fast.
 
     Args:
         env_spec: The environment.
