@@ -8,7 +8,7 @@ BIN := .venv/bin
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: run setup test test-fast check clean
+.PHONY: run setup test test-fast check bench clean
 
 run: .venv/.installed
 	$(BIN)/onedemo serve --host "$(HOST)" --port "$(PORT)" --data-dir "$(DATA_DIR)" --demo "$(DEMO)"
@@ -25,6 +25,10 @@ check: .venv/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --level error --pythonpath $(BIN)/python
+
+bench: .venv/.installed
+	$(BIN)/python -m pip install --quiet --editable '.[bench]'
+	$(BIN)/onedemo bench speed --json speed.json --out speed-report
 
 clean:
 	rm -rf .venv *.egg-info .pytest_cache .ruff_cache

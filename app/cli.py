@@ -346,7 +346,8 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
         print(f"{key:18} {value:g}")
 
 
-def _bench_speed(arguments: argparse.Namespace) -> None:
+def _bench_speed(arguments: argparse.Namespace) -> int:
+    import importlib.util
     import shlex
     import time
 
@@ -360,6 +361,8 @@ def _bench_speed(arguments: argparse.Namespace) -> None:
         _check_output(arguments.json, arguments.json.absolute().parent)
     if arguments.out is not None and arguments.out.exists() and not arguments.out.is_dir():
         raise UserError(f"--out {arguments.out} is a file; give the name of a directory")
+    if arguments.out is not None and importlib.util.find_spec("matplotlib") is None:
+        raise UserError("--out needs matplotlib for its charts: pip install -e '.[bench]'")
     began = time.monotonic()
     results = speed.measure(
         quick=arguments.quick,
@@ -373,6 +376,7 @@ def _bench_speed(arguments: argparse.Namespace) -> None:
         write_atomic(arguments.json, (json.dumps(about, indent=1) + "\n").encode())
     if arguments.out is not None:
         report.write_report(arguments.out, "onedemo: speed", results, about)
+    return int(any(getattr(result, "failed", False) for result in results))
 
 
 def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:

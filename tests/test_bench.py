@@ -92,8 +92,18 @@ def test_a_part_that_fails_does_not_lose_the_others(monkeypatch):
     monkeypatch.setattr(physics, "measure", broken)
     monkeypatch.setattr(fitting, "measure", lambda quick: made_up()[:1])
     results = speed.measure(quick=True, parts=["physics", "fitting"])
-    assert results[0] == Skipped(name="physics", reason="it failed: RuntimeError: no luck")
+    assert results[0] == Skipped(name="physics", reason="RuntimeError: no luck", failed=True)
     assert isinstance(results[1], Figure) and results[1].name == "a_vs_b"
+
+
+def test_a_failed_part_fails_the_command(monkeypatch, capsys):
+    from trainer.bench import fitting
+
+    monkeypatch.setattr(fitting, "measure", lambda quick: 1 / 0)
+    assert main(["bench", "speed", "--part", "fitting"]) == 1
+    assert "fitting: failed, ZeroDivisionError" in capsys.readouterr().out
+    monkeypatch.setattr(fitting, "measure", lambda quick: made_up()[:1])
+    assert main(["bench", "speed", "--part", "fitting"]) == 0
 
 
 def test_bad_options(tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from trainer.inputs import HARMONICS, KINDS, feature_size, policy_inputs
-from trainer.policy import Normaliser, Policy, PolicyConfig, ValueFunction, mlp
+from trainer.policy import Normaliser, Policy, PolicyConfig, Tanh, ValueFunction, mlp
 
 
 def policy(kind="clock", seed=0, table=None):
@@ -175,3 +175,12 @@ def test_rescaling_the_value_function_keeps_its_values():
     torch.testing.assert_close(after, before, rtol=1e-4, atol=1e-3)
     assert value.return_mean.item() == pytest.approx(0.8 * 5 + 0.2 * 700)
     torch.testing.assert_close(targets * value.return_std + value.return_mean, torch.linspace(500, 900, 50))
+
+
+def test_tanh_is_torchs_in_value_and_gradient():
+    x = torch.linspace(-12, 12, 401, dtype=torch.float64, requires_grad=True)
+    for dtype, tolerance in ((torch.float64, 1e-12), (torch.float32, 1e-6)):
+        theirs, ours = torch.tanh(x.to(dtype)), Tanh()(x.to(dtype))
+        torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance)
+        slopes = [torch.autograd.grad(y.sum(), x)[0] for y in (ours, theirs)]
+        torch.testing.assert_close(*slopes, rtol=tolerance, atol=tolerance)

@@ -42,6 +42,11 @@ def test_settings_that_contradict_the_run_are_refused(store, tmp_path):
         find_run(store, tmp_path, DEMO, name=None, wanted=load_config(None, {"seed": 1}))
 
 
+def test_a_run_may_go_on_on_another_device(store, tmp_path):
+    run = add_run(store, tmp_path, DEMO, load_config(None, {"device": "cuda"}), name=None)
+    assert find_run(store, tmp_path, DEMO, name=run, wanted=load_config()) == (run, load_config())
+
+
 def test_another_video_under_the_same_name_is_refused(store, tmp_path):
     add_run(store, tmp_path, DEMO, load_config(), name=None)
     with pytest.raises(UserError, match="another video"):

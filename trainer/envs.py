@@ -10,7 +10,6 @@ Shapes: N lanes, o observations, a actions, q = v positions and velocities, S = 
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +23,7 @@ from mujoco import rollout
 
 from trainer import profiling
 from trainer.errors import UserError
+from trainer.priority import cores
 
 profiling.switch_off()
 
@@ -273,7 +273,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.dt = self.env_spec.dt
         self.terminate_when_unhealthy = terminate_when_unhealthy
         if nthread is None:
-            nthread = min(len(os.sched_getaffinity(0)), num_envs)
+            nthread = min(cores(), num_envs)
         if num_envs < 1 or self.horizon < 1 or nthread < 0:
             raise ValueError(
                 "num_envs and horizon must be at least 1 and nthread at least 0, "

@@ -26,6 +26,8 @@ from trainer.timing import frame_of_step
 from trainer.trpo import Trpo
 
 _RANDOM_LANES = 16
+_DEVICE_LANES = 1024
+"""From so many lanes on an accelerator acts itself; with fewer the way there and back costs more."""
 
 
 class Learner:
@@ -58,6 +60,7 @@ class Learner:
             seed=config.seed,
         ).to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
+        self._acts_on_device = config.device != "cpu" and config.rollouts.lanes >= _DEVICE_LANES
         self._collector = self._make_collector(config.rollouts.lanes, seed=config.seed, stagger=True)
 
     def look_at(self, features: np.ndarray) -> None:
@@ -117,7 +120,7 @@ class Learner:
         sizes = self.config.rollouts
         left = -(-(sizes.total_steps - self.env_steps) // sizes.lanes)
         steps = max(1, min(sizes.steps, left))
-        policy = self._policy.snapshot(on_device=self.config.device != "cpu")
+        policy = self._policy.snapshot(on_device=self._acts_on_device)
         rollouts = self._collector.collect(policy, steps)
         rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
         stats = self._trpo.update(rollouts, rewards)

@@ -1,4 +1,4 @@
-"""Who waits for whom when the processor is short: computing gives way to the page."""
+"""The processor: how many cores there are, and who waits when they are short (computing, for the page)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ import threading
 
 _STEPS = 10
 """On the scale of ``nice``: about a tenth of the time that a thread of the page would get beside it."""
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def give_way() -> None:

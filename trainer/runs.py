@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
@@ -48,6 +49,8 @@ def find_run(
     if not file.exists():  # lost with the directory; the database has it too
         write_atomic(file, run["config"].encode())
     config = load_config(file)
+    if wanted is not None:  # where it computes is no part of what a run is
+        config = replace(config, device=wanted.device)
     if wanted is not None and wanted != config:
         raise UserError(
             f"run {run['id']!r} has other settings than those given (see {file}); "

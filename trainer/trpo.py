@@ -160,8 +160,10 @@ class Trpo:
         orders = [self._permutation(len(inputs_Bf)) for _ in range(self.config.value_epochs)]
         regression = partial(self._fit_value, inputs_Bf, returns_B, orders)
         beside = self._beside.submit(regression) if self._beside is not None else None
-        accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B, sample)
-        value_loss = regression() if beside is None else beside.result()
+        try:
+            accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B, sample)
+        finally:  # whatever happens, nothing goes on behind the caller's back
+            value_loss = regression() if beside is None else beside.result()
         self.policy.observe(rollouts.obs, rollouts.clock)
         log_std = self.policy.log_std.detach()
         return TrpoStats(
@@ -188,6 +190,8 @@ class Trpo:
         """Goes on where ``state_dict`` was taken."""
         self.value.load_state_dict(state["value"])
         self._adam.load_state_dict(state["adam"])
+        for group in self._adam.param_groups:  # what was saved says how it was computed, too
+            group["fused"] = True
         self._generator.set_state(state["generator"])
 
     def _permutation(self, count: int) -> torch.Tensor:

@@ -29,6 +29,7 @@ from trainer.motion import (
     until_fall,
 )
 from trainer.policy import Policy, PolicyConfig, check_device
+from trainer.priority import cores
 from trainer.rollouts import Collector, Episodes, evaluate
 from trainer.trpo import Trpo, TrpoConfig
 
@@ -51,7 +52,7 @@ class HandcodedConfig:
     """Control steps in an episode: 8 s."""
     evaluate_every: int = 10
     """Iterations between evaluations (16 deterministic episodes)."""
-    threads: int = 2
+    threads: int = field(default_factory=cores)
     """Of the physics and of the learning. Any number gives the same numbers."""
     physics: str = "mujoco"
     """"mujoco" or "warp" (``rollouts.physics``)."""

@@ -69,6 +69,8 @@ class Skipped:
 
     name: str
     reason: str
+    failed: bool = False
+    """Whether it should have been taken: an error, not something that this machine lacks."""
 
 
 Result = Figure | Growth | Skipped

@@ -5,7 +5,7 @@ A rate is control steps per second, all lanes together. N lanes, T control steps
 
 from __future__ import annotations
 
-import os
+import multiprocessing
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -17,27 +17,28 @@ from mujoco import rollout
 
 from trainer import envs, profiling
 from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
+from trainer.priority import cores
 
 LANES = 64
 MISSING = "{} is not installed: pip install -e '.[bench]'"
 """Why a comparison was skipped."""
 _SPEC = envs.SPECS["hopper"]
-_FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 
 class Bare:
-    """``mujoco.rollout`` on the stock model and nothing around it: what any batched Hopper can reach.
+    """``mujoco.rollout`` on the Hopper and nothing around it: what a batched Hopper can reach.
 
     Args:
         lanes: N.
-        threads: Of the pool; all this process may use if None.
-        shipped: With profiling and chunks as the Python package has them; else as fast as we know.
+        shipped: The stock model, profiling and chunks as the Python package has them; else every
+            setting that makes our own physics quick.
     """
 
-    def __init__(self, lanes: int, threads: int | None = None, *, shipped: bool = False) -> None:
-        self._models = [mujoco.MjModel.from_xml_path(str(_SPEC.xml))] * lanes
-        threads = min(cores(), lanes) if threads is None else threads
+    def __init__(self, lanes: int, *, shipped: bool = False) -> None:
+        model = mujoco.MjModel.from_xml_path(str(_SPEC.xml)) if shipped else envs.physics_model(_SPEC)
+        self._models = [model] * lanes
+        threads = min(cores(), lanes)
         self._pool = rollout.Rollout(nthread=threads)
         self._data = [mujoco.MjData(self._models[0]) for _ in range(max(1, threads))]
         self._chunk = None if shipped else -(-lanes // max(1, threads))
@@ -71,11 +72,6 @@ class Bare:
         self._pool.close()
 
 
-def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
 def full_states(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """Positions (N, q) and velocities (N, v) as MuJoCo's full physics states at time 0, (N, S)."""
     return np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
@@ -100,14 +96,15 @@ def _against_bare(turns: int, steps: int) -> list[Result]:
             "physics_vs_bare", f"physics, batched Hopper, {LANES} lanes",
             ours=rates["ours"], theirs=rates["bare"], against=f"mujoco.rollout bare, {cores()} threads",
             reach=0.95, unit="steps/s",
-            equal="the same states and actions, one call per control step, all cores; bare is as fast as we "
-            "know to call it: no argument checks, no profiling, one piece of the lanes a thread; ours also "
-            "gives observations and rewards, and does not look for constraint islands",
+            equal="the same states and actions, one call per control step, all cores; bare has every "
+            "setting that makes ours quick: no argument checks, no profiling, no search for islands, one "
+            "piece of the lanes a thread; ours also gives observations and rewards",
         ),
         ratio(
             "physics_vs_bare_as_shipped", "the same", ours=shipped["ours"], theirs=shipped["bare"],
             against=f"mujoco.rollout as the Python package has it, {cores()} threads", reach=None,
-            unit="steps/s", equal="as above, but bare with the package's profiling and sizes of pieces",
+            unit="steps/s",
+            equal="as above, but bare with the stock model and the package's profiling and sizes of pieces",
         ),
     ]  # fmt: skip
 
@@ -145,9 +142,7 @@ def _against_envpool(turns: int, steps: int) -> list[Result]:
     try:
         import envpool  # pyright: ignore[reportMissingImports]
     except ImportError:
-        return [
-            Skipped(name="physics_vs_envpool", reason="envpool is not installed: pip install -e '.[bench]'")
-        ]
+        return [Skipped(name="physics_vs_envpool", reason=MISSING.format("envpool"))]
     peer = envpool.make_gymnasium("Hopper-v4", num_envs=LANES, num_threads=cores(), seed=0)
     env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
     env.reset(seed=0)
@@ -163,7 +158,8 @@ def _against_envpool(turns: int, steps: int) -> list[Result]:
             "physics_vs_envpool", "the same, episodes that end at a fall",
             ours=rates["ours"], theirs=rates["envpool"], against=f"envpool {envpool.__version__} Hopper-v4",
             reach=1.0, unit="steps/s",
-            equal=f"{LANES} lanes, {cores()} threads, the same random actions, both restart after a fall",
+            equal=f"{LANES} lanes, {cores()} threads, the same random actions, both restart after a fall; "
+            "no profiling in either",
         )
     ]  # fmt: skip
 
@@ -173,9 +169,11 @@ def _against_gymnasium(turns: int, steps: int, quick: bool) -> list[Result]:
     steps = min(steps, 100)
     makers: dict[str, Callable[[], gymnasium.vector.VectorEnv]] = {}
     for count in (1, 8) if quick else (1, 4, 16, 64):
-        makers[f"SyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.SyncVectorEnv([_hopper] * n)
+        makers[f"SyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.SyncVectorEnv([stock_hopper] * n)
     for count in (2,) if quick else (2, 4, 16):
-        makers[f"AsyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.AsyncVectorEnv([_hopper] * n)
+        makers[f"AsyncVectorEnv, {count}"] = lambda n=count: gymnasium.vector.AsyncVectorEnv(
+            [stock_hopper] * n
+        )
     pilot = {name: _gymnasium_rate(make, steps, 2)[-1] for name, make in makers.items()}
     best = max(pilot, key=lambda name: pilot[name])
     with profiling.as_shipped():  # processes that a peer starts now keep it
@@ -199,12 +197,17 @@ def _against_gymnasium(turns: int, steps: int, quick: bool) -> list[Result]:
         ratio(
             "physics_vs_gymnasium", "the same", ours=rates["ours"], theirs=rates["gymnasium"],
             against=f"gymnasium {gymnasium.__version__} {best} lanes", reach=1.5, unit="steps/s",
-            equal=f"Hopper-v5, random actions, both end and restart at a fall; tried (steps/s): {tried}",
+            equal="Hopper-v5, random actions, both end and restart at a fall; MuJoCo's profiling is on in "
+            f"gymnasium's, as shipped, and off in ours; tried (steps/s): {tried}",
         )
     ]  # fmt: skip
 
 
-def _hopper() -> gymnasium.Env:
+def stock_hopper() -> gymnasium.Env:
+    """Hopper-v5 as gymnasium has it."""
+    # In a process of its own, importing this module has switched profiling off: as shipped, it is on.
+    if multiprocessing.parent_process() is not None:
+        profiling.switch_on()
     return gymnasium.make("Hopper-v5")
 
 

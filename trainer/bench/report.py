@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-import os
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,6 +13,7 @@ from typing import Any
 
 from trainer.bench.figures import Figure, Growth, Result, Skipped
 from trainer.files import write_atomic
+from trainer.priority import cores
 from trainer.runs import program_version
 
 _PACKAGES = (
@@ -56,7 +56,7 @@ def machine() -> dict[str, Any]:
         except PackageNotFoundError:
             continue
     return {
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": cores(),
         "processor": _processor(),
         "python": platform.python_version(),
         "packages": packages,
@@ -71,7 +71,7 @@ def table(results: Sequence[Result]) -> str:
             rows.append((_label(figure), _value(figure.value, figure.unit), _spread(figure), *_reach(figure)))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines += [f"{skip.name}: not run, {skip.reason}" for skip in results if isinstance(skip, Skipped)]
+    lines += [f"{skip.name}: {_why(skip)}" for skip in results if isinstance(skip, Skipped)]
     return "\n".join(lines)
 
 
@@ -120,7 +120,7 @@ def _markdown(title: str, results: Sequence[Result], about: dict[str, Any], char
     lines += ["| " + " | ".join(row) + " |" for row in _rows(results)]
     lines += ["", "How the work was made equal, and how figures were taken:", ""]
     lines += [f"- **{f.name}**: {f.equal}." for f in results if isinstance(f, Figure) and f.equal]
-    lines += ["", *(f"- **{s.name}**: not run, {s.reason}." for s in results if isinstance(s, Skipped)), ""]
+    lines += ["", *(f"- **{s.name}**: {_why(s)}." for s in results if isinstance(s, Skipped)), ""]
     lines += [f"![{growth.title}]({file})" for growth, file in charts]
     return "\n".join(lines) + "\n"
 
@@ -130,7 +130,7 @@ def _html(title: str, results: Sequence[Result], about: dict[str, Any], charts: 
         return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row) + "</tr>"
 
     notes = {f.name: f.equal for f in results if isinstance(f, Figure) and f.equal}
-    notes |= {s.name: f"not run, {s.reason}" for s in results if isinstance(s, Skipped)}
+    notes |= {s.name: f"{_why(s)}" for s in results if isinstance(s, Skipped)}
     items = "".join(f"<li><b>{name}</b>: {html.escape(note)}" for name, note in notes.items())
     pictures = "".join(f'<img src="{file}" alt="{html.escape(growth.title)}">' for growth, file in charts)
     facts = html.escape(_facts(about).replace("`", ""))
@@ -200,6 +200,10 @@ def _facts(about: dict[str, Any]) -> str:
         f"{machine['cores']} cores ({machine['processor']}), Python {machine['python']}, {packages}. "
         "Ratios are medians over turns A B A B ...; least and most of all turns show the spread."
     )
+
+
+def _why(skipped: Skipped) -> str:
+    return f"{'failed' if skipped.failed else 'not run'}, {skipped.reason}"
 
 
 def _label(figure: Figure) -> str:

@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from trainer.bench.figures import Result, by_turns, ratio, single
-from trainer.bench.physics import Bare, cores, full_states
+from trainer.bench.physics import Bare, full_states
 from trainer.config import RunConfig, load_config
 from trainer.learner import Learner
 from trainer.predictor import Snapshot
+from trainer.priority import cores
 from trainer.records import Rollouts
 from trainer.store import RatedSegment
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -13,10 +12,11 @@ import numpy as np
 from trainer import envs
 from trainer.baselines.handcoded import HandcodedConfig, train_handcoded
 from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
+from trainer.priority import cores
 
 LANES = (512, 2048, 8192, 32768)
 _SPEC = envs.SPECS["hopper"]
-_CORES = len(os.sched_getaffinity(0))
+_CORES = cores()
 
 
 def measure(quick: bool = False) -> list[Result]:
@@ -54,7 +54,7 @@ def whole_training(steps: int, device: str) -> Figure:
     result = train_handcoded(config, progress=False)
     score = result.curve[-1]
     return single(
-        "gpu_backflip_s", f"a whole backflip training, {steps:,} steps, {device}",
+        "gpu_backflip_s", f"a whole training of the hand-coded baseline, {steps:,} steps, {device}",
         [time.perf_counter() - began], unit="s",
         how=f"TRPO on the hand-coded reward, {lanes} lanes; final policy: reward {score.reward_mean:,.0f}, "
         f"{score.net_turns_mean:.1f} net turns; kernels were compiled before",

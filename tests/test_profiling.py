@@ -1,0 +1,33 @@
+"""MuJoCo's profiling: off for us, on for peers, and of no consequence to the physics."""
+
+import mujoco
+import numpy as np
+
+from trainer import envs, profiling
+
+
+def stepped():
+    model = envs.physics_model(envs.SPECS["hopper"])
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5, -0.3, 0.2
+    mujoco.mj_step(model, data, 200)
+    return data.qpos.copy()
+
+
+def test_off_unless_asked_for_and_it_changes_no_bit():
+    callback, shipped = profiling._global()
+    assert callback is not None and shipped, "MuJoCo keeps its clock elsewhere: physics is a fifth slower"
+    assert callback.value is None
+    quick = stepped()
+    with profiling.as_shipped():
+        assert callback.value == shipped
+        slow = stepped()
+    assert callback.value is None
+    np.testing.assert_array_equal(quick, slow)
+
+
+def test_without_the_global_nothing_changes(monkeypatch):
+    monkeypatch.setattr(profiling, "_global", lambda: (None, None))
+    profiling.switch_off()
+    with profiling.as_shipped():
+        assert np.isfinite(stepped()).all()
