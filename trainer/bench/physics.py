@@ -222,7 +222,7 @@ def _gymnasium_rate(make: Callable[[], gymnasium.vector.VectorEnv], steps: int, 
 
 
 def _by_lanes(turns: int, quick: bool) -> Growth:
-    sizes = (1, 8, 64, 512) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+    sizes = (1, 64, 512) if quick else (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
     ours, bare = [], []
     for lanes in sizes:
         rates = _ours_and_bare(lanes, max(10, (2_000 if quick else 8_000) // lanes), turns)

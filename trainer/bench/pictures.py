@@ -60,7 +60,7 @@ def measure(quick: bool, *, seconds: tuple[int, ...] | None = None) -> list[Resu
         ``render_vs_gymnasium``, ``features_vs_single`` and the same on one core,
         ``features_cached_ms``, and the growth ``demo_length``.
     """
-    seconds = seconds or ((2, 4, 8) if quick else (8, 16, 32, 60))
+    seconds = seconds or ((2, 8) if quick else (8, 16, 32, 60))
     with tempfile.TemporaryDirectory() as directory:
         place = Path(directory)
         return [

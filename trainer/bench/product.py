@@ -49,7 +49,7 @@ def measure(quick: bool) -> list[Result]:
             *asyncio.run(default_run(data_dir, quick=quick)),
             asyncio.run(start_time(data_dir, 1 if quick else 5)),
             *asyncio.run(
-                press_times(data_dir, turns=2 if quick else 6, seconds=1.2 if quick else 10.0)
+                press_times(data_dir, turns=1 if quick else 6, seconds=2.0 if quick else 10.0)
             ),
         ]  # fmt: skip
 
@@ -88,7 +88,7 @@ async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
         data_dir: A new one.
         quick: Few ratings before practice, few iterations.
     """
-    pretrain, online, iterations = (12, 4, 2) if quick else (200, 40, 12)
+    pretrain, online, iterations = (12, 2, 1) if quick else (200, 40, 12)
     with serving(data_dir, [f"ratings.pretrain={pretrain}"] if quick else []) as server:
         async with browser_session() as session:
             watch = await open_tab(session, server.links["researcher"])
