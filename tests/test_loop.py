@@ -90,7 +90,7 @@ def test_every_reward_can_be_traced_to_ratings(store, demo):
     snapshots = {row["number"]: row for row in store.snapshots(run)}
     for iteration in store.iterations(run):
         snapshot = snapshots[iteration["snapshot"]]
-        ratings = store.training_set(run, as_of=snapshot["last_event"])
+        ratings = store.ratings_as_of(run, as_of=snapshot["last_event"])
         assert len(ratings) == snapshot["ratings"] >= 12
         assert (store.path.parent / "runs" / run / "snapshots" / f"{iteration['snapshot']:06d}.pt").exists()
     stages = [row[6] for row in store.iter_ratings(run)]

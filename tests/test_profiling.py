@@ -4,10 +4,11 @@ import mujoco
 import numpy as np
 
 from trainer import envs, profiling
+from trainer.physics import load_model
 
 
 def stepped():
-    model = envs.physics_model(envs.SPECS["hopper"])
+    model = load_model(envs.SPECS["hopper"].xml)
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.5, -0.3, 0.2
     mujoco.mj_step(model, data, 200)

@@ -127,10 +127,10 @@ def test_training_set_as_of_an_event(store, clips, ann):
     first = store.rate(clips[0].id, ann.id, 4, latency_ms=1)
     second = store.rate(clips[1].id, ann.id, 2, latency_ms=1)
     store.undo(clips[0].id, ann.id)
-    assert [r.value for r in store.training_set("r", as_of=first)] == [4]
-    assert [r.value for r in store.training_set("r", as_of=second)] == [4, 2]
-    assert [r.value for r in store.training_set("r")] == [2]
-    assert store.training_set("r") == [(second, clips[1].id, 7, 2)]
+    assert [r.value for r in store.ratings_as_of("r", as_of=first)] == [4]
+    assert [r.value for r in store.ratings_as_of("r", as_of=second)] == [4, 2]
+    assert [r.value for r in store.ratings_as_of("r")] == [2]
+    assert store.ratings_as_of("r") == [(second, clips[1].id, 7, 2)]
     np.testing.assert_array_equal(store.segment(clips[1].id).obs, segment(1).obs)
 
 

@@ -94,7 +94,7 @@ def test_the_set_is_the_stores_whatever_was_asked_before(store):
         as_of = events[int(rng.integers(len(events)))] if rng.random() < 0.3 else events[-1]
         kept = training_set.at(as_of)
         fresh = TrainingSet(store, "r").at(as_of)
-        wanted = store.training_set("r", as_of=as_of)
+        wanted = store.ratings_as_of("r", as_of=as_of)
         assert [(r.event, r.demo_step, r.value) for r in kept] == [
             (w.event, w.demo_step, w.value) for w in wanted
         ]

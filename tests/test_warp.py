@@ -14,6 +14,7 @@ from trainer.bench.figures import Skipped
 from trainer.config import load_config
 from trainer.errors import UserError
 from trainer.learner import Learner
+from trainer.physics import RolloutPhysics, load_model
 from trainer.policy import Policy, PolicyConfig
 from trainer.rollouts import Collector
 from trainer.trpo import Trpo, TrpoConfig
@@ -73,8 +74,8 @@ def apart(ours, theirs):
 
 def own_jump(qpos, qvel, action):
     """How far the processor's velocities after one step scatter when the state is moved by rounding."""
-    model = envs.physics_model(envs.SPECS["hopper"])
-    physics = envs.RolloutPhysics(model, 4, 200, 0)
+    model = load_model(envs.SPECS["hopper"].xml)
+    physics = RolloutPhysics(model, 4, 200, 0)
     state = np.tile(np.concatenate([[0], qpos, qvel]), (200, 1))
     state[1:, 1:] += np.random.default_rng(0).normal(0, 5e-7, (199, 12))
     after = physics.step(state, np.tile(action, (200, 1)))
@@ -195,7 +196,7 @@ def test_contacts_without_room_are_an_error(room, monkeypatch):
     from trainer import warp
 
     lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
-    model = envs.physics_model(envs.SPECS["hopper"])
+    model = load_model(envs.SPECS["hopper"].xml)
     states = np.concatenate([np.zeros((4, 1)), lying, np.zeros((4, 6))], axis=1)
     warp.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
     monkeypatch.setattr(warp, "_room", lambda model, pairs: room)
@@ -207,7 +208,7 @@ def test_an_unknown_device_names_those_there_are():
     from trainer.warp import WarpPhysics
 
     with pytest.raises(UserError, match=r"no device 'cuda:7' .* there are: cpu"):
-        WarpPhysics(envs.physics_model(envs.SPECS["hopper"]), 4, 1, device="cuda:7")
+        WarpPhysics(load_model(envs.SPECS["hopper"].xml), 4, 1, device="cuda:7")
 
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):

@@ -12,24 +12,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import mujoco
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from mujoco import rollout
 
-from trainer import profiling
 from trainer.errors import UserError
+from trainer.physics import load_model, make_physics
 from trainer.priority import cores
-
-profiling.switch_off()
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-_CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -130,22 +126,6 @@ def make(
     )
 
 
-def physics_model(env_spec: EnvSpec) -> mujoco.MjModel:
-    """The robot's model as it is stepped.
-
-    One robot is one island of constraints: looking for islands is switched off, which changes no bit
-    of what comes out and makes physics 1.08 times as fast.
-
-    Args:
-        env_spec: The environment.
-    """
-    model = mujoco.MjModel.from_xml_path(str(env_spec.xml))
-    flag = getattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND", None)  # MuJoCo before 4 does not look by itself
-    if flag is not None:
-        model.opt.disableflags |= flag.value
-    return model
-
-
 def observe(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     """The observation of states: everything but x, velocities clipped.
 
@@ -178,61 +158,6 @@ def healthy(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray
     limit = env_spec.healthy_state
     inside = np.maximum(np.abs(qpos[..., 2:]).max(-1), np.abs(qvel).max(-1)) < limit
     return inside & (low_z < z) & (z < high_z) & (low_angle < angle) & (angle < high_angle)
-
-
-class Physics(Protocol):
-    """What moves the lanes: rigid-body dynamics with no memory besides the states it is given."""
-
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """One control step of every lane, the same action held through its physics steps.
-
-        Args:
-            states: (time, qpos, qvel), (N, S), float64; not changed.
-            actions: (N, a), float64; the motors clamp them.
-
-        Returns:
-            The states after it, (N, S), float64, a fresh array.
-        """
-        ...
-
-    def close(self) -> None:
-        """Frees threads or device memory."""
-        ...
-
-
-class RolloutPhysics:
-    """``Physics`` on MuJoCo's own C++ thread pool, in float64.
-
-    Args:
-        model: The robot.
-        frame_skip: Physics steps in a control step.
-        num_envs: Lanes.
-        nthread: Threads beside the caller's; 0 for none.
-    """
-
-    def __init__(self, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> None:
-        self._models = [model] * num_envs
-        self._frame_skip = frame_skip
-        self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]
-        self._pool = rollout.Rollout(nthread=nthread)
-        # One piece of the lanes for each thread: handing out smaller ones costs more than it evens out.
-        self._chunk = -(-num_envs // max(nthread, 1))
-        self._substeps = np.empty((num_envs, frame_skip, mujoco.mj_stateSize(model, _FULL)))
-        self._control = np.empty((num_envs, frame_skip, model.nu))
-
-    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """See ``Physics.step``."""
-        self._control[:] = actions[:, None]
-        # Unchecked: shapes are right by construction, and the checks cost as much as the rest of a step.
-        self._pool.rollout(
-            self._models, self._data, states, self._control, control_spec=_CONTROL,
-            skip_checks=True, nstep=self._frame_skip, state=self._substeps, chunk_size=self._chunk,
-        )  # fmt: skip
-        return self._substeps[:, -1].copy()
-
-    def close(self) -> None:
-        """Ends the threads."""
-        self._pool.close()
 
 
 class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -284,8 +209,8 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_fps": round(1 / self.dt),
         }
-        self.model = physics_model(self.env_spec)
-        self._physics = _make_physics(physics, self.model, self.env_spec.frame_skip, num_envs, nthread)
+        self.model = load_model(self.env_spec.xml)
+        self._physics = make_physics(physics, self.model, self.env_spec.frame_skip, num_envs, nthread)
         self._initial = np.empty(mujoco.mj_stateSize(self.model, _FULL))
         mujoco.mj_getState(self.model, mujoco.MjData(self.model), self._initial, _FULL)
         self._state = np.tile(self._initial, (num_envs, 1))
@@ -451,13 +376,3 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._state[lanes, 1:] += self.np_random.uniform(-noise, noise, size)
         self.elapsed[lanes] = 0
         self._limit[lanes] = self.horizon
-
-
-def _make_physics(kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> Physics:
-    if kind == "mujoco":
-        return RolloutPhysics(model, frame_skip, num_envs, nthread)
-    if kind == "warp":
-        from trainer.warp import WarpPhysics  # an optional extra, slow to import
-
-        return WarpPhysics(model, frame_skip, num_envs)
-    raise ValueError(f"physics must be 'mujoco' or 'warp', got {kind!r}")

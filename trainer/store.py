@@ -321,7 +321,7 @@ class Store:
         """Number of the newest event of all runs, 0 if there is none."""
         return self._rows("SELECT MAX(id) FROM events")[0][0] or 0
 
-    def training_set(self, run: str, as_of: int | None = None) -> list[Rating]:
+    def ratings_as_of(self, run: str, as_of: int | None = None) -> list[Rating]:
         """The ratings of a run that held when event ``as_of`` was written (default: now), in order.
 
         The same events give the same list, so a snapshot can be traced to its ratings and made again

@@ -29,10 +29,10 @@ class TrainingSet:
         Only segments of ratings that the last call did not give are read.
 
         Returns:
-            As ``Store.training_set``, with the segments. Their positions and velocities are left out
+            As ``Store.ratings_as_of``, with the segments. Their positions and velocities are left out
             (``qpos`` and ``qvel`` are (W, 0)).
         """
-        ratings = self._store.training_set(self._run, as_of=event)
+        ratings = self._store.ratings_as_of(self._run, event)
         self._kept = {r.event: self._kept.get(r.event) or self._read(r) for r in ratings}
         return list(self._kept.values())
 

@@ -2,7 +2,7 @@
 
 The same model, integrator (Runge-Kutta 4) and time step as on the processor, in float32.
 
-Agreement with ``envs.RolloutPhysics``, measured on Warp's processor device: 256,000 control steps of
+Agreement with ``physics.RolloutPhysics``, measured on Warp's processor device: 256,000 control steps of
 hoppers flying, standing and fallen under random actions, each begun in the same state. Positions (m,
 rad) differ by 1e-7 in the median and by 1e-6 in 999 of 1,000 steps; velocities (m/s, rad/s) by 5e-7
 and 5e-6. Stated tolerance: 5e-6 and 5e-5. Beyond it (11 steps in 100,000, up to 1e-3 and 0.3) the

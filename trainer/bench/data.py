@@ -30,7 +30,6 @@ from trainer.training_set import TrainingSet
 _RUN = "bench"
 _RATERS, _ITERATIONS, _WAITING = 50, 500, 20
 _MIB = 1024.0
-_EXPORT = "import sys; from app.cli import main; sys.exit(main())"
 _BLOCK = 1 << 20
 
 _NUMBERS = "WITH RECURSIVE numbers (n) AS (SELECT ? UNION ALL SELECT n + 1 FROM numbers WHERE n < ?) "
@@ -174,7 +173,7 @@ def _press(store: Store) -> None:
 
 def _export(directory: Path) -> tuple[float, float]:
     """Runs the command; seconds to its first rows, and the most memory it had, MiB."""
-    command = [sys.executable, "-c", _EXPORT, "export", "--data-dir", str(directory)]
+    command = [sys.executable, "-m", "app.cli", "export", "--data-dir", str(directory)]
     began = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

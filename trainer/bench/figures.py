@@ -59,8 +59,6 @@ class Growth:
     """Sizes, ascending."""
     y: Mapping[str, Sequence[float]]
     """Cost at each size, by the name of the line."""
-    log: bool = True
-    """Whether the axes are logarithmic; that of the cost is so only if it grows tenfold."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -101,7 +99,7 @@ def by_turns(
 
 def ratio(
     name: str, what: str, *, ours: Sequence[float], theirs: Sequence[float], against: str,
-    reach: float | None, equal: str, unit: str, at_least: bool = True, higher_is_better: bool = True,
+    reach: float | None, equal: str, unit: str, at_least: bool = True,
 ) -> Figure:  # fmt: skip
     """Our figure over theirs, turn by turn.
 
@@ -115,7 +113,6 @@ def ratio(
         equal: How the work was made equal.
         unit: Of both sides, for the record.
         at_least: Whether ``reach`` is a lower bound.
-        higher_is_better: False for times: the ratio is then theirs over ours.
 
     Raises:
         ValueError: If the sides have different numbers of turns, or none.
@@ -123,7 +120,7 @@ def ratio(
     if len(ours) != len(theirs) or not ours:
         raise ValueError(f"{name}: {len(ours)} turns of ours, {len(theirs)} of theirs")
     pairs = zip(ours, theirs, strict=True)
-    ratios = [a / b if higher_is_better else b / a for a, b in pairs]
+    ratios = [a / b for a, b in pairs]
     return Figure(
         name=name, what=what, against=against, unit="x", value=statistics.median(ratios), low=min(ratios),
         high=max(ratios), reach=reach, at_least=at_least, equal=equal,

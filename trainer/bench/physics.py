@@ -17,6 +17,7 @@ from mujoco import rollout
 
 from trainer import envs, profiling
 from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
+from trainer.physics import load_model
 from trainer.priority import cores
 
 LANES = 64
@@ -36,7 +37,7 @@ class Bare:
     """
 
     def __init__(self, lanes: int, *, shipped: bool = False) -> None:
-        model = mujoco.MjModel.from_xml_path(str(_SPEC.xml)) if shipped else envs.physics_model(_SPEC)
+        model = mujoco.MjModel.from_xml_path(str(_SPEC.xml)) if shipped else load_model(_SPEC.xml)
         self._models = [model] * lanes
         threads = min(cores(), lanes)
         self._pool = rollout.Rollout(nthread=threads)

@@ -166,13 +166,12 @@ def _draw(growth: Growth, file: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(4.2, 2.9), layout="constrained")
     for (name, values), colour in zip(growth.y.items(), _COLOURS, strict=False):
         axes.plot(growth.x, values, marker="o", markersize=3.5, linewidth=1.8, color=colour, label=name)
-    if growth.log:
-        axes.set_xscale("log")
-        every = -(-len(growth.x) // _MOST_TICKS)
-        axes.set_xticks(growth.x[::every], labels=[_short(x) for x in growth.x[::every]])
-        axes.minorticks_off()
+    axes.set_xscale("log")
+    every = -(-len(growth.x) // _MOST_TICKS)
+    axes.set_xticks(growth.x[::every], labels=[_short(x) for x in growth.x[::every]])
+    axes.minorticks_off()
     values = [value for line in growth.y.values() for value in line]
-    if growth.log and max(values) > 10 * min(values):
+    if max(values) > 10 * min(values):
         axes.set_yscale("log")
     else:  # less than a decade: a logarithm would make much of little
         axes.set_ylim(0, 1.3 * max(values))

@@ -12,6 +12,7 @@ import numpy as np
 from trainer import envs
 from trainer.baselines.handcoded import HandcodedConfig, train_handcoded
 from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
+from trainer.physics import Physics, RolloutPhysics, load_model
 from trainer.priority import cores
 
 LANES = (512, 2048, 8192, 32768)
@@ -75,14 +76,14 @@ def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: 
     """
     from trainer.warp import WarpPhysics
 
-    model = envs.physics_model(_SPEC)
+    model = load_model(_SPEC.xml)
     rates: dict[str, list[float]] = {}
     where = ""
     for count in lanes:
         warp = WarpPhysics(model, _SPEC.frame_skip, count, device)
         where = warp.device.name
-        sides: dict[str, envs.Physics] = {
-            "mujoco": envs.RolloutPhysics(model, _SPEC.frame_skip, count, _CORES),
+        sides: dict[str, Physics] = {
+            "mujoco": RolloutPhysics(model, _SPEC.frame_skip, count, _CORES),
             "warp": warp,
         }
         steps = max(8, lane_steps // count)
@@ -101,7 +102,7 @@ def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: 
     )
 
 
-def _rate_of(physics: envs.Physics, motors: int, lanes: int, steps: int) -> Callable[[], float]:
+def _rate_of(physics: Physics, motors: int, lanes: int, steps: int) -> Callable[[], float]:
     """A repetition: the lanes from their start for some steps, in control steps/s."""
     rng = np.random.default_rng(0)
     state = np.zeros((lanes, 13))
