@@ -1,10 +1,13 @@
 import ast
+import os
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from worlds import Thumbnail, falling_demo, small_config
 
 import trainer
@@ -99,7 +102,8 @@ def test_every_reward_can_be_traced_to_ratings(store, demo):
 
 def test_the_same_seed_gives_the_same_run(demo, tmp_path):
     curves = []
-    for name in ("one", "two"):
+    for name, threads in (("one", 2), ("two", 1)):
+        torch.set_num_threads(threads)  # what the process had before must not matter
         store = Store(tmp_path / name)
         make_trainer(store, demo, Simulated(name="rule", rate=by_rule)).work()
         rows = store.iterations("r")
@@ -136,6 +140,9 @@ def test_people_rate_and_the_trainer_follows(store, demo):
     trainer_.start()
     wait_for(lambda: trainer_.status().phase == "pretrain")
     assert trainer_.acting_policy() is not None
+    if sys.platform == "linux":  # people at the page come first
+        (thread,) = [t for t in threading.enumerate() if t.name == "trainer"]
+        assert os.getpriority(os.PRIO_PROCESS, thread.native_id) > os.getpriority(os.PRIO_PROCESS, 0)
     for _ in range(4):
         wait_for(lambda: store.waiting_clips("r", "cut"))
         assert len(store.waiting_clips("r", "cut")) <= 4  # the queue is not longer than asked

@@ -251,6 +251,41 @@ def test_hopper_learns_to_stay_up():
     assert per_episode[-1] > 4 * per_episode[0]
 
 
+def test_value_after_a_step_that_ended_an_episode_is_of_where_it_ended(monkeypatch):
+    """There the next column belongs to another episode."""
+    policy = small_policy()
+    rollouts = made_up_rollouts(policy)
+    ended = np.random.default_rng(0).random(rollouts.clock.shape) < 0.2
+    elsewhere = np.where(ended[..., None], 3.0, rollouts.next_inputs).astype(np.float32)
+    changed = {"next_inputs": elsewhere, "truncated": ended}
+    rollouts = Rollouts(**{key: getattr(rollouts, key) for key in Rollouts.__slots__} | changed)
+    trpo = Trpo(policy, TrpoConfig(), seed=0)
+    trpo.update(rollouts, rollouts.obs[..., 0])  # V is zero everywhere before the first fit
+    seen = {}
+
+    def spy(rewards, values, next_values, *rest, **options):
+        seen.update(values=values, next_values=next_values)
+        return gae(rewards, values, next_values, *rest, **options)
+
+    monkeypatch.setattr("trainer.trpo.gae", spy)
+    with torch.no_grad():
+        values = trpo.value(torch.from_numpy(rollouts.inputs)).numpy()
+        next_values = trpo.value(torch.from_numpy(elsewhere)).numpy()
+    trpo.update(rollouts, rollouts.obs[..., 0])
+    np.testing.assert_allclose(seen["values"], values, atol=1e-6)
+    np.testing.assert_allclose(seen["next_values"], next_values, atol=1e-6)
+    assert np.abs(next_values[:, :-1] - values[:, 1:])[ended[:, :-1]].max() > 1e-3
+
+
+def test_a_state_saved_before_the_fused_optimiser_goes_on_fused():
+    *_, trpo, _, _ = hopper(0, 1, lanes=4, steps=50)
+    saved = trpo.state_dict()
+    saved["adam"]["param_groups"][0]["fused"] = None
+    *_, fresh, _, _ = hopper(0, 0, lanes=4)
+    fresh.load_state_dict(saved)
+    assert fresh.state_dict()["adam"]["param_groups"][0]["fused"] is True
+
+
 def test_same_seed_same_policy_and_resumed_training_is_the_same():
     policy, *_ = hopper(3, 4, lanes=4, steps=100)
     again, trpo, collector, _ = hopper(3, 2, lanes=4, steps=100)
