@@ -65,7 +65,10 @@ def _parser() -> argparse.ArgumentParser:
 
     train = _command(commands, "train", _train, "the same trainer without a browser, rated by a program")
     _run_options(train)
-    train.add_argument("--rater", default="oracle", help="simulated rater (oracle)")
+    train.add_argument(
+        "--rater", default="oracle", metavar="NAME",
+        help="oracle (default), script[:TABLE.json], package.module:Class; or oracle+mistake:0.1+jitter",
+    )  # fmt: skip
     train.add_argument(
         "--ratings", type=int, metavar="N", help="ratings in all, 4 of 7 before practice (350)"
     )

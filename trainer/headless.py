@@ -40,7 +40,7 @@ def train(
         demo: What is to be learned; the oracle needs its hidden states.
         config: ``ratings.pretrain + ratings.online`` is the rater's budget.
         encoder: Looks at the demo's frames.
-        rater: Name of the simulated rater.
+        rater: Name of the simulated rater, see ``trainer.raters.make_rater``.
         name: Of the run; an unfinished run of that name goes on.
         progress: Show a progress bar on standard error.
 
@@ -54,16 +54,19 @@ def train(
     hidden_file = hidden_path(demo.path)
     hidden = load_hidden(hidden_file) if hidden_file.exists() else None
     given = sum(store.ratings_by_class(name)) if name else 0
-    budget = config.ratings.pretrain + config.ratings.online - given
-    simulated = make_rater(rater, hidden, demo=demo.name, budget=budget)
+    budget = config.ratings.pretrain + config.ratings.online
+    simulated = make_rater(rater, hidden, demo=demo, budget=budget, given=given, seed=config.seed)
     found = find_run(store, data_dir, demo, name=name, wanted=config) if name else None
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate),
     )  # fmt: skip
-    with hold(trainer.directory / "lock"):
-        failure = _work(trainer, config.rollouts.total_steps, progress)
+    try:
+        with hold(trainer.directory / "lock"):
+            failure = _work(trainer, config.rollouts.total_steps, progress)
+    finally:
+        simulated.close()
     if failure is not None:
         raise failure
     practised = time.monotonic() - began

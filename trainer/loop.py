@@ -31,7 +31,7 @@ from trainer.motion import TASK_REWARDS
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
 from trainer.priority import give_way
-from trainer.records import Demo, Segment, Status
+from trainer.records import Clip, Demo, Segment, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Transitions
 from trainer.store import NewClip, Store
@@ -43,6 +43,8 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
+_MOST_DECLINED = 100
+"""A simulated rater that declines so many clips in a row has nothing to say."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -51,8 +53,8 @@ class Simulated:
 
     name: str
     """In the store."""
-    rate: Callable[[Segment, int], int]
-    """(segment, demo step) to a rating, 1..5."""
+    rate: Callable[[Segment, int], int | None]
+    """(segment, demo step) to a rating, 1..5, or None: declined, another clip is asked instead."""
 
 
 class Trainer:
@@ -92,6 +94,7 @@ class Trainer:
         self._training_set = TrainingSet(store, run)
         self._pool: Transitions | None = None
         self._policy: PolicySnapshot | None = None
+        self._declined = 0
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
         self._control = threading.Lock()
@@ -264,14 +267,19 @@ class Trainer:
         return True
 
     def _ask(self, learner: Learner) -> None:
-        """Cuts as many clips as are missing from the queue, from the newest rollouts.
+        """Cuts clips; in place of those that a simulated rater declines it cuts others."""
+        while self._ask_missing(learner):
+            pass
+
+    def _ask_missing(self, learner: Learner) -> bool:
+        """Cuts as many clips as are missing from the queue, from the newest rollouts; True if some still are.
 
         While the first iteration runs people go on with the random policy, so that nobody waits.
         """
         if self._clips is not None:
             self._clips.retry()
         if self._pool is None:  # resumed: the first iteration brings them
-            return
+            return False
         # Waiting is read before given, so that a press in between is missing from neither.
         waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
         given, missing = self._ratings(), 0
@@ -281,7 +289,7 @@ class Trainer:
             queue = min(self.config.ratings.queue, self._status.target_ratings - given)
             missing = queue - len(waiting)
         if missing <= 0:
-            return
+            return False
         # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
         seed = [self.config.seed, learner.iteration, self.store.count_clips(self.run)]
         questions = choose(
@@ -303,11 +311,22 @@ class Trainer:
         clips = self.store.add_clips(self.run, new)
         if self._clips is not None:
             self._clips.submit(clips)
-        if self._simulated is not None:
-            rater = self.store.ensure_rater(self._simulated.name, "simulated")
-            for clip, cut in zip(clips, new, strict=True):
-                value = self._simulated.rate(cut.segment, clip.demo_step)
+        return self._simulated is not None and self._answer(self._simulated, clips, new)
+
+    def _answer(self, simulated: Simulated, clips: list[Clip], cut: list[NewClip]) -> bool:
+        """Has fresh clips rated by the simulated rater; whether it declined any."""
+        rater, declined = self.store.ensure_rater(simulated.name, "simulated"), False
+        for clip, new in zip(clips, cut, strict=True):
+            value = simulated.rate(new.segment, clip.demo_step)
+            if value is not None:
                 self.store.rate(clip.id, rater.id, value, latency_ms=0)
+                self._declined = 0
+                continue
+            self.store.skip(clip.id, rater.id, latency_ms=0)
+            self._declined, declined = self._declined + 1, True
+            if self._declined == _MOST_DECLINED:
+                raise UserError(f"rater {simulated.name} declined {_MOST_DECLINED} clips in a row")
+        return declined
 
     def _due(self, learner: Learner) -> int:
         """Ratings that a simulated rater has been asked for by now, in all."""

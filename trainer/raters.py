@@ -1,4 +1,7 @@
-"""Simulated raters. They compare what a person would see; the oracle reads hidden demo states to do so.
+"""Simulated raters, by name. They compare what a person would see; the oracle reads hidden demo states.
+
+``oracle``, ``script[:TABLE.json]`` or ``package.module:Class``; the first two may be followed by error
+models, ``oracle+mistake:0.1+jitter`` (``trainer.rater_errors``), and by ``+seed:N``.
 
 Nothing that learns may import this module or ``trainer.hidden``: a rater sees the demo's states, the
 learner sees nothing but the rating.
@@ -8,61 +11,68 @@ Shapes: W control steps, q = v = 6.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from trainer.errors import UserError
 from trainer.hidden import HiddenStates
-from trainer.records import Segment
+from trainer.judge import Judge, RatingBudgetSpent
+from trainer.own_rater import OwnRater
+from trainer.rater_errors import Errors, parse_errors
+from trainer.records import Demo, Segment
+from trainer.scripted import Script, load_marks, table_path
+
+__all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appearance", "make_rater"]
 
 THRESHOLDS = (0.9, 1.3, 1.7, 2.15)
 """Mean distances (see ``appearance``) beyond which the oracle takes one point off."""
 
-
-class RatingBudgetSpent(Exception):
-    """The rater was asked once more than it agreed to."""
+_CHOICES = "oracle, script, script:TABLE.json, package.module:Class"
 
 
 class SimulatedRater(Protocol):
     """What the trainer asks when no person is there."""
 
-    def rate(self, segment: Segment, demo_step: int) -> int:
-        """The rating, 1..5, of a segment beside the demo from control step ``demo_step`` on."""
+    def rate(self, segment: Segment, demo_step: int) -> int | None:
+        """The rating, 1..5, of a segment beside the demo from control step ``demo_step`` on.
+
+        None if it declines; then another clip is asked.
+        """
+        ...
+
+    def close(self) -> None:
+        """Frees what it holds."""
         ...
 
 
-class Oracle:
+class Oracle(Judge):
     """Rates by the mean distance between the robot's states and the demo's hidden ones.
 
     Args:
         hidden: The demo's states.
         budget: Ratings it will give, enforced here.
         thresholds: Four distances, ascending.
+        given: Ratings it gave before, in an earlier process.
+        seed: Of what chance there is in the errors.
+        errors: What it gets wrong.
     """
 
     def __init__(
-        self, hidden: HiddenStates, *, budget: int, thresholds: tuple[float, ...] = THRESHOLDS
+        self,
+        hidden: HiddenStates,
+        *,
+        budget: int,
+        thresholds: Sequence[float] = THRESHOLDS,
+        given: int = 0,
+        seed: int = 0,
+        errors: Errors = (),
     ) -> None:
+        super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
         self._demo = appearance(hidden.qpos, hidden.qvel)
-        self._thresholds = np.asarray(thresholds)
-        self.budget = budget
-        self.given = 0
-
-    def rate(self, segment: Segment, demo_step: int) -> int:
-        """The rating, 1..5.
-
-        Args:
-            segment: W control steps of the robot.
-            demo_step: Where the demo clip beside it begins.
-
-        Raises:
-            RatingBudgetSpent: If the budget is used up.
-        """
-        if self.given >= self.budget:
-            raise RatingBudgetSpent(f"the budget of {self.budget} ratings is spent")
-        self.given += 1
-        return int(self._rating(self.distance(segment.qpos, segment.qvel, demo_step).mean()))
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance in appearance, step by step, (W,), from the demo's states at the same steps on."""
@@ -77,12 +87,9 @@ class Oracle:
             qvel: Velocities, (T, v).
 
         Returns:
-            1..5. Costs nothing of the budget: no learner gets to see it.
+            1..5, without any error. Costs nothing of the budget: no learner gets to see it.
         """
         return float(self._rating(self.distance(qpos, qvel, 0)).mean())
-
-    def _rating(self, distance: np.ndarray) -> np.ndarray:
-        return 5 - (np.asarray(distance)[..., None] > self._thresholds).sum(axis=-1)
 
 
 def appearance(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
@@ -111,17 +118,43 @@ def appearance(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=-1)
 
 
-def make_rater(name: str, hidden: HiddenStates | None, *, demo: str, budget: int) -> SimulatedRater:
+def make_rater(
+    name: str, hidden: HiddenStates | None, *, demo: Demo, budget: int, given: int = 0, seed: int = 0
+) -> SimulatedRater:
     """The simulated rater of that name.
 
+    Args:
+        name: ``oracle``, ``script``, ``script:TABLE.json`` or ``package.module:Class``, then ``+`` and
+            error models or ``seed:N``.
+        hidden: The demo's states, if it has any; only the oracle gets them.
+        demo: What is compared with.
+        budget: Ratings the rater will give in a run, enforced by itself.
+        given: Of these, before now.
+        seed: Of the rater's errors, unless the name gives one.
+
     Raises:
-        UserError: If there is none, or the demo has no hidden states to compare with.
+        UserError: If there is no such rater, or it does not fit the demo.
     """
-    if name != "oracle":
-        raise UserError(f"unknown rater {name!r}; choose one of: oracle")
-    if hidden is None:
+    base, *parts = name.split("+")
+    kind, _, rest = base.partition(":")
+    errors, own_seed = parse_errors(parts, name)
+    seed = seed if own_seed is None else own_seed
+    if base == "oracle":
+        if hidden is None:
+            raise UserError(
+                f"the oracle rater compares hidden demo states, and demo {demo.name!r} has none; "
+                "use a built-in demo or a table of marks (--rater script), or rate it yourself with "
+                "`onedemo serve`"
+            )
+        return Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
+    if kind == "script":
+        marks = load_marks(Path(rest) if rest else table_path(demo.path), demo)
+        return Script(marks, budget=budget, given=given, seed=seed, errors=errors)
+    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
+        raise UserError(f"unknown rater {base!r}; choose one of: {_CHOICES}")
+    if parts:
         raise UserError(
-            f"the oracle rater compares hidden demo states, and demo {demo!r} has none; "
-            "use a built-in demo, or rate it yourself with `onedemo serve`"
+            f"rater {name!r}: error models need a rater that measures a distance, oracle or script; "
+            f"let {base} make its own errors"
         )
-    return Oracle(hidden, budget=budget)
+    return OwnRater(base, demo=demo, budget=budget, given=given)
