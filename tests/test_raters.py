@@ -1,11 +1,18 @@
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
 import numpy as np
 import pytest
+from worlds import Thumbnail, falling_demo, small_config
 
 from trainer.envs import observe, spec
 from trainer.errors import UserError
+from trainer.headless import train
 from trainer.hidden import HiddenStates
 from trainer.raters import Oracle, RatingBudgetSpent, appearance, make_rater
-from trainer.records import Segment
+from trainer.records import Demo, Segment
+from trainer.store import Store
 
 
 def states(steps=100, spin=-0.03):
@@ -71,8 +78,102 @@ def test_true_similarity_costs_nothing(hidden):
     assert oracle.true_similarity(still[:-1], np.zeros((100, 6))) < 3
 
 
-def test_unknown_raters_and_demos_without_states(hidden):
-    with pytest.raises(UserError, match="unknown rater 'orakel'; choose one of: oracle"):
-        make_rater("orakel", hidden, demo="d", budget=1)
+def demo(name="d"):
+    return Demo(name=name, sha256="", path=Path("d.webm"), fps=30.0, frames=24, width=64, height=48)
+
+
+@pytest.mark.parametrize("name", ["orakel", "", "oracle:x", "a.b", "a:b.c", "7.a:B", "scripted"])
+def test_unknown_raters(name, hidden):
+    with pytest.raises(UserError, match=f"unknown rater '{name}'; choose one of: oracle, script, "):
+        make_rater(name, hidden, demo=demo(), budget=1)
+
+
+def test_the_oracle_needs_hidden_states():
     with pytest.raises(UserError, match="demo 'person' has none"):
-        make_rater("oracle", None, demo="person", budget=1)
+        make_rater("oracle", None, demo=demo("person"), budget=1)
+
+
+def make(name, hidden, **more):
+    return make_rater(name, hidden, demo=demo(), budget=200, **more)
+
+
+def ratings_of(rater, hidden, count=200):
+    """Ratings of the demo's own states, turned further and further."""
+    found = []
+    for k in range(count):
+        qpos = hidden.qpos.copy()
+        qpos[:, 2] += k % 20 / 8
+        found.append(rater.rate(segment(qpos, hidden.qvel, 10), 10))
+    return found
+
+
+def test_the_name_says_the_errors_and_the_seed(hidden):
+    plain = ratings_of(make("oracle", hidden), hidden)
+    wrong = ratings_of(make("oracle+mistake:0.3", hidden, seed=1), hidden)
+    assert 30 <= sum(a != b for a, b in zip(plain, wrong, strict=True)) <= 90
+    assert wrong == ratings_of(make("oracle+mistake:0.3", hidden, seed=1), hidden)
+    assert wrong != ratings_of(make("oracle+mistake:0.3", hidden, seed=2), hidden)
+    assert wrong == ratings_of(make("oracle+mistake:0.3+seed:1", hidden, seed=2), hidden)
+    assert plain == ratings_of(make("oracle+seed:5", hidden), hidden)
+
+
+def test_the_order_of_the_names_does_not_matter(hidden):
+    one = ratings_of(make("oracle+harsh+mistake:0.2+jitter", hidden), hidden)
+    assert one == ratings_of(make("oracle+jitter+mistake:0.2+harsh", hidden), hidden)
+
+
+def test_a_resumed_rater_goes_on_where_it_was(hidden):
+    name = "oracle+mistake:0.3+jitter+drift+noisy"
+    whole = ratings_of(make(name, hidden), hidden)
+    assert whole[:80] == ratings_of(make(name, hidden), hidden, 80)
+    rest = make(name, hidden, given=80)
+    assert whole[80:] == ratings_of(rest, hidden, 120)
+    with pytest.raises(RatingBudgetSpent, match="budget of 200"):
+        ratings_of(rest, hidden, 1)
+
+
+# In a run
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(tmp_path / "data")
+    yield store
+    store.close()
+
+
+def run(store, demo, rater, **config):
+    return train(
+        store=store, data_dir=store.path.parent, demo=demo, config=small_config(**config),
+        encoder=Thumbnail(), rater=rater, progress=False,
+    )  # fmt: skip
+
+
+def test_declined_clips_are_skipped_and_others_asked(store, tmp_path):
+    world = falling_demo(tmp_path / "demo")
+    summary = run(store, world, "oracle+skip:0.6")
+    assert summary["ratings"] == 18
+    with closing(sqlite3.connect(store.path)) as db:
+        kinds = dict(db.execute("SELECT kind, COUNT(*) FROM events GROUP BY kind").fetchall())
+    assert kinds["rate"] == 18 and kinds["skip"] >= 3
+    assert store.count_clips(summary["run"]) == 18 + kinds["skip"]
+    assert not store.waiting_clips(summary["run"], "cut")
+    stages = {key: sum(counts) for key, counts in store.tallies(summary["run"]).items()}
+    assert stages == {("oracle+skip:0.6", "pretrain"): 12, ("oracle+skip:0.6", "online"): 6}
+
+
+def test_a_rater_that_declines_everything_ends_the_run(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(Oracle, "rate", lambda self, segment, demo_step: None)
+    with pytest.raises(UserError, match=r"rater oracle declined 1\d\d clips in a row; without ratings"):
+        run(store, falling_demo(tmp_path / "demo"), "oracle")
+    assert sum(store.ratings_by_class()) == 0
+
+
+def test_a_rater_that_tires_of_the_policy_does_not_stop_it(store, tmp_path, monkeypatch):
+    """From the first iteration on it declines everything: the run ends with what it has."""
+    rate = Oracle.rate
+    monkeypatch.setattr(
+        Oracle, "rate", lambda self, s, step: rate(self, s, step) if self.given < 12 else None
+    )
+    summary = run(store, falling_demo(tmp_path / "demo"), "oracle")
+    assert summary["ratings"] == 12 and summary["env_steps"] == 2400

@@ -44,7 +44,7 @@ _TICK_S = 0.2
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
 _MOST_DECLINED = 100
-"""A simulated rater that declines so many clips in a row has nothing to say."""
+"""After so many declined clips in a row, a simulated rater is asked again when there are new rollouts."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -267,9 +267,20 @@ class Trainer:
         return True
 
     def _ask(self, learner: Learner) -> None:
-        """Cuts clips; in place of those that a simulated rater declines it cuts others."""
+        """Cuts clips; in place of those that a simulated rater declines it cuts others.
+
+        Raises:
+            UserError: If a simulated rater declines whatever the random policy does.
+        """
+        self._declined = 0
         while self._ask_missing(learner):
-            pass
+            if self._declined >= _MOST_DECLINED:
+                if learner.iteration == 0 and self._simulated is not None:
+                    raise UserError(
+                        f"rater {self._simulated.name} declined {self._declined} clips in a row; "
+                        "without ratings there is nothing to learn from"
+                    )
+                return
 
     def _ask_missing(self, learner: Learner) -> bool:
         """Cuts as many clips as are missing from the queue, from the newest rollouts; True if some still are.
@@ -324,8 +335,6 @@ class Trainer:
                 continue
             self.store.skip(clip.id, rater.id, latency_ms=0)
             self._declined, declined = self._declined + 1, True
-            if self._declined == _MOST_DECLINED:
-                raise UserError(f"rater {simulated.name} declined {_MOST_DECLINED} clips in a row")
         return declined
 
     def _due(self, learner: Learner) -> int:

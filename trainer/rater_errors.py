@@ -96,8 +96,8 @@ def drift(look: Look, factor: float) -> Look:
 def jitter(look: Look, spread: float) -> Look:
     """Boundaries move from rating to rating, all four by the same normal number.
 
-    Its standard deviation is ``spread``, 0.25 by default, times the mean width of a class, so that a
-    clip at a boundary gets either rating and one in the middle of a class hardly ever another.
+    Its standard deviation is ``spread``, 0.25 by default, times the mean width of a class: a clip at a
+    boundary gets either rating as often, one in the middle of a class another one time in twenty.
     """
     return replace(look, thresholds=look.thresholds + spread * look.width * look.normal)
 

@@ -150,7 +150,7 @@ def make_rater(
     if kind == "script":
         marks = load_marks(Path(rest) if rest else table_path(demo.path), demo)
         return Script(marks, budget=budget, given=given, seed=seed, errors=errors)
-    if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
+    if kind == "oracle" or not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
         raise UserError(f"unknown rater {base!r}; choose one of: {_CHOICES}")
     if parts:
         raise UserError(

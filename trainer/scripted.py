@@ -134,7 +134,7 @@ def load_marks(path: Path, demo: Demo) -> np.ndarray:
         ) from None
     if marks.ndim != 2 or marks.shape[1] != 3 or len(marks) < 2 or not np.isfinite(marks).all():
         raise UserError(
-            f"rater script: {path} needs two marks or more, [seconds, pitch in degrees, airborne], all numbers"
+            f"rater script: {path} needs two marks or more: [seconds, pitch in degrees, airborne] in numbers"
         )
     if marks[0, 0] < 0 or not (np.diff(marks[:, 0]) > 0).all():
         raise UserError(f"rater script: the seconds of the marks in {path} must ascend from 0")
