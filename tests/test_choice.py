@@ -13,7 +13,9 @@ def rollouts(clock):
         field.name: np.zeros((lanes, steps, sizes[field.name]) if field.name in sizes else (lanes, steps))
         for field in fields(Rollouts)
     }
-    return Rollouts(**(arrays | {"clock": clock}))
+    ends = np.zeros(clock.shape, bool)
+    ends[:, :-1] = np.diff(clock, axis=1) < 0
+    return Rollouts(**(arrays | {"clock": clock, "truncated": ends, "terminated": np.zeros_like(ends)}))
 
 
 def test_clips_are_whole_time_aligned_and_inside_the_demo():

@@ -2,26 +2,25 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.predictor import (
-    PredictorConfig,
-    SimilarityNet,
-    Snapshot,
-    class_weights,
-    fit,
-    standard_inputs,
-    visual_inputs,
-)
+from trainer.network import SimilarityNet, class_weights, standard_inputs
+from trainer.predictor import PredictorConfig, Snapshot, View, fit, visual_inputs
 from trainer.records import Segment
 from trainer.store import RatedSegment
 
 FRAMES = 60
-QUICK = PredictorConfig(updates=400, visual_dims=8)
+
+
+def paper(**changes):
+    return PredictorConfig(**({"kind": "network", "appearance": False, "members": 1} | changes))
+
+
+QUICK = paper(updates=400, visual_dims=8)
 
 
 @pytest.fixture(scope="module")
 def visual():
     features = np.random.default_rng(0).normal(size=(FRAMES, 40)).cumsum(axis=0)
-    return visual_inputs(features, 8)
+    return View(visual=visual_inputs(features, 8), track=None)
 
 
 def world(count, seed, skew=False):
@@ -67,7 +66,7 @@ def test_visual_inputs_keep_distances_and_do_not_depend_on_the_svds_signs():
 
 
 def test_the_sum_of_two_maps_is_the_papers_concatenation(visual):
-    net = SimilarityNet(8, PredictorConfig(), torch.Generator().manual_seed(0))
+    net = SimilarityNet(8, paper(), torch.Generator().manual_seed(0))
     v, s = torch.randn(7, 8), torch.randn(7, 15)
     weight = torch.cat([net.fuse_visual.weight, net.fuse_standard.weight], dim=1)
     joined = torch.cat([v, net.standard(s)], dim=1) @ weight.T + net.fuse_standard.bias
@@ -75,17 +74,17 @@ def test_the_sum_of_two_maps_is_the_papers_concatenation(visual):
 
 
 def test_the_network_is_the_papers():
-    net = SimilarityNet(8, PredictorConfig(), torch.Generator())
+    net = SimilarityNet(8, paper(), torch.Generator())
     kinds = [type(m).__name__ for m in net.standard]
     assert kinds == ["Linear", "ReLU", "Linear", "ReLU"]
     assert [type(m).__name__ for m in net.head] == ["ReLU", "Linear", "ReLU", "Linear"]
-    plain = SimilarityNet(8, PredictorConfig(additional_layer=False), torch.Generator())
+    plain = SimilarityNet(8, paper(additional_layer=False), torch.Generator())
     assert [type(m).__name__ for m in plain.head] == ["ReLU", "Linear"]
 
 
 def test_it_learns_a_rule_of_frame_and_state(visual):
     ratings, frames = world(300, seed=0)
-    snapshot, stats = fit(ratings, frames, visual, PredictorConfig(visual_dims=8), number=1, seed=0)
+    snapshot, stats = fit(ratings, frames, visual, paper(visual_dims=8), number=1, seed=0)
     unseen, unseen_frames = world(200, seed=1)
     truth = np.array([r.value for r in unseen])
     predicted = np.array(
@@ -121,7 +120,7 @@ def test_a_fit_leaves_the_global_generator_alone(visual):
     torch.manual_seed(1)
     expected = torch.rand(3)
     torch.manual_seed(1)
-    fit(*world(10, seed=0), visual, PredictorConfig(updates=2, visual_dims=8), number=1, seed=0)
+    fit(*world(10, seed=0), visual, paper(updates=2, visual_dims=8), number=1, seed=0)
     assert torch.equal(torch.rand(3), expected)
 
 
@@ -131,7 +130,7 @@ def test_equal_batches_find_rare_classes_better(visual):
     unseen, unseen_frames = world(300, seed=1)
     recall = {}
     for sampling in ("equal", "random"):
-        config = PredictorConfig(sampling=sampling, updates=150, visual_dims=8)
+        config = paper(sampling=sampling, updates=150, visual_dims=8)
         snapshot, _ = fit(ratings, frames, visual, config, number=1, seed=0)
         rare = [(r, f) for r, f in zip(unseen, unseen_frames, strict=True) if r.value >= 4]
         hits = [snapshot.ratings(f, r.segment.obs, r.segment.actions).mean() > 2.5 for r, f in rare]
@@ -143,7 +142,7 @@ def test_absent_classes_do_no_harm(visual):
     ratings, frames = world(60, seed=0)
     only = [i for i, r in enumerate(ratings) if r.value in (1, 3)]
     chosen = [ratings[i] for i in only]
-    for config in (QUICK, PredictorConfig(class_weights=True, updates=50, visual_dims=8)):
+    for config in (QUICK, paper(class_weights=True, updates=50, visual_dims=8)):
         snapshot, stats = fit(chosen, frames[only], visual, config, number=1, seed=0)
         assert np.isfinite(stats.loss)
         probabilities = snapshot.probabilities(frames[0], chosen[0].segment.obs, chosen[0].segment.actions)
@@ -152,7 +151,7 @@ def test_absent_classes_do_no_harm(visual):
 
 def test_one_rating_is_enough_and_none_is_not(visual):
     ratings, frames = world(1, seed=0)
-    fit(ratings, frames, visual, PredictorConfig(updates=3, visual_dims=8), number=1, seed=0)
+    fit(ratings, frames, visual, paper(updates=3, visual_dims=8), number=1, seed=0)
     with pytest.raises(ValueError, match="at least one rating"):
         fit([], np.empty((0, 38)), visual, QUICK, number=1, seed=0)
 
@@ -169,7 +168,7 @@ def test_ratings_are_expectations_or_classes(visual):
     assert probabilities.shape == (40, 38, 5)
     np.testing.assert_allclose(probabilities.sum(axis=-1), 1, atol=1e-5)
     np.testing.assert_allclose(snapshot.ratings(*question), probabilities @ np.arange(1, 6), rtol=1e-5)
-    config = PredictorConfig(updates=400, visual_dims=8, reward="argmax")
+    config = paper(updates=400, visual_dims=8, reward="argmax")
     hard, _ = fit(ratings, frames, visual, config, number=1, seed=0)
     assert set(np.unique(hard.ratings(*question))) <= {1.0, 2.0, 3.0, 4.0, 5.0}
 
@@ -193,4 +192,4 @@ def test_class_weights_by_hand():
 @pytest.mark.parametrize("change", [{"sampling": "x"}, {"reward": "x"}, {"hidden": 0}, {"learning_rate": 0}])
 def test_bad_settings_say_which(change):
     with pytest.raises(ValueError, match=f"predictor.{next(iter(change))}"):
-        PredictorConfig(**change)
+        paper(**change)

@@ -185,7 +185,7 @@ def test_learning_works_on_it():
 
 def test_a_run_can_be_set_to_it():
     """The first steps of the random policy are the processor's, but for rounding."""
-    config = load_config(None, {"rollouts.lanes": 4, "rollouts.threads": 1})
+    config = load_config(None, {"method": "paper", "rollouts.lanes": 4, "rollouts.threads": 1})
     on_warp = replace(config, rollouts=replace(config.rollouts, physics="warp"))
     first, second = (Learner(c, 30, 30.0).random_rollouts().qpos[:, 1:6] for c in (config, on_warp))
     assert 0 < np.abs(first - second).max() < 1e-5

@@ -61,6 +61,7 @@ def falling_demo(directory: Path, seed: int = 0) -> Demo:
 def small_config(**overrides):
     """Settings under which a whole run takes seconds."""
     small = {
+        "method": "paper",
         "ratings.pretrain": 12,
         "ratings.online": 6,
         "ratings.queue": 4,

@@ -1,15 +1,27 @@
 """Which clip of the agent is asked against which clip of the demo: decided here and nowhere else.
 
-Shapes: N lanes, T control steps, W control steps a clip.
+Shapes: N lanes, T control steps, W control steps a clip, n candidates.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from trainer.records import Rollouts
+
+Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""(lanes, starts, demo_steps), (n,) each, to predicted ratings and the disagreement on them, (n,) each."""
+
+_CANDIDATES = 3000
+_SHARES = (0.4, 0.3, 0.3)
+"""Of a round: rated highest, most disagreed on, any."""
+_APART = 15
+"""Control steps of the demo within which ..."""
+_MOST_THERE = 2
+"""... so many clips of a round may begin, while others are to be had."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -22,9 +34,21 @@ class Question:
 
 
 def choose(
-    rollouts: Rollouts, count: int, clip_steps: int, demo_steps: int, rng: np.random.Generator
+    rollouts: Rollouts,
+    count: int,
+    clip_steps: int,
+    demo_steps: int,
+    rng: np.random.Generator,
+    *,
+    any_time: bool = False,
+    judge: Judge | None = None,
 ) -> list[Question]:
-    """Chooses clips uniformly, each beside the demo of the same time, as in the paper.
+    """Chooses clips to be rated.
+
+    Uniformly if nothing judges, as in the paper. Else a mix: high predicted ratings, because random
+    motion hardly ever deserves one and the reward is made of them; disagreement between the
+    predictor's members, where a rating tells most; and any, so that nothing stays unseen. Within a round
+    they spread over the demo.
 
     Args:
         rollouts: What the agent did, (N, T).
@@ -32,32 +56,70 @@ def choose(
         clip_steps: W.
         demo_steps: Control steps of the demo; a clip ends before them.
         rng: Decides.
+        any_time: Pair a clip with any moment of the demo instead of the moment of its own clock.
+        judge: What the predictor says of a clip beside the demo, if there is one.
 
     Returns:
         ``count`` questions, fewer if the rollouts hold fewer places to cut. No two overlap unless
         there is no other way.
     """
-    clock = rollouts.clock
-    last = clip_steps - 1
-    if clock.shape[1] < clip_steps:
+    lanes, starts = _places(rollouts, clip_steps)
+    if not len(lanes):
         return []
-    whole = clock[:, last:] - clock[:, : clock.shape[1] - last] == last
-    lanes, starts = np.nonzero(whole & (clock[:, last:] < demo_steps))
     order = rng.permutation(len(lanes))
+    lanes, starts = lanes[order], starts[order]
+    if any_time:
+        demo = rng.integers(demo_steps - clip_steps + 1, size=len(lanes))
+    else:
+        # Beside the demo of the clip's middle: with an elastic clock both ends are then about as far off.
+        middle = clip_steps // 2
+        demo = np.maximum(rollouts.clock[lanes, starts + middle].astype(int) - middle, 0)
+    within = np.flatnonzero(demo + clip_steps <= demo_steps)
+    if judge is not None:  # looking at some of them is enough
+        within = within[: max(_CANDIDATES, 20 * count)]
+    lanes, starts, demo = lanes[within], starts[within], demo[within]
+    ranks = [np.arange(len(lanes))]
+    if judge is not None:
+        rating, doubt = judge(lanes, starts, demo)
+        ranks = [np.argsort(-rating, kind="stable"), np.argsort(-doubt, kind="stable"), ranks[0]]
     chosen: list[int] = []
-    spare: list[int] = []
-    taken: dict[int, list[int]] = {}
-    for index in order:
-        lane, start = int(lanes[index]), int(starts[index])
-        if all(abs(start - other) >= clip_steps for other in taken.get(lane, [])):
-            taken.setdefault(lane, []).append(start)
-            chosen.append(index)
-            if len(chosen) == count:
-                break
-        elif len(spare) < count:
-            spare.append(index)
-    chosen += spare[: count - len(chosen)]
-    return [
-        Question(lane=int(lanes[i]), start=int(starts[i]), demo_step=int(clock[lanes[i], starts[i]]))
-        for i in chosen
-    ]
+    for share, rank in zip(_SHARES[-len(ranks) :], ranks, strict=True):
+        wanted = count if rank is ranks[-1] else len(chosen) + round(share * count)
+        _take(chosen, rank, min(wanted, count), lanes, starts, demo, clip_steps, spread=judge is not None)
+    return [Question(lane=int(lanes[i]), start=int(starts[i]), demo_step=int(demo[i])) for i in chosen]
+
+
+def _places(rollouts: Rollouts, clip_steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Lanes and starts of all clips that lie within one episode."""
+    ended = rollouts.terminated | rollouts.truncated
+    if ended.shape[1] < clip_steps:
+        return np.empty(0, int), np.empty(0, int)
+    before = np.concatenate([np.zeros_like(ended[:, :1], dtype=int), np.cumsum(ended, axis=1)], axis=1)
+    places = ended.shape[1] - clip_steps + 1
+    inside = before[:, clip_steps - 1 : clip_steps - 1 + places] - before[:, :places]
+    lanes, starts = np.nonzero(inside == 0)
+    return lanes, starts
+
+
+def _take(
+    chosen: list[int], rank: np.ndarray, wanted: int, lanes: np.ndarray, starts: np.ndarray,
+    demo: np.ndarray, clip_steps: int, *, spread: bool,
+) -> None:  # fmt: skip
+    """Appends to ``chosen`` from the front of ``rank`` until there are ``wanted``.
+
+    First without clips that overlap others, or crowd one part of the demo; if that is not enough, any.
+    """
+    for strict in (True, False):
+        for index in rank:
+            if len(chosen) >= wanted:
+                return
+            if index in chosen:
+                continue
+            if strict:
+                others = np.array(chosen, int)
+                close = np.abs(starts[others] - starts[index]) < clip_steps
+                if (close & (lanes[others] == lanes[index])).any():
+                    continue
+                if spread and (np.abs(demo[others] - demo[index]) < _APART).sum() >= _MOST_THERE:
+                    continue
+            chosen.append(int(index))

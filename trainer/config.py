@@ -15,6 +15,7 @@ from typing import Any, TypeVar, get_type_hints
 
 from trainer.errors import UserError
 from trainer.policy import PolicyConfig
+from trainer.practice import PracticeConfig
 from trainer.predictor import PredictorConfig
 from trainer.trpo import TrpoConfig
 
@@ -31,6 +32,16 @@ class RatingsConfig:
     """Ratings of clips of the policy in training."""
     clip_seconds: float = 0.3
     """Length of a clip."""
+    starts: str = "random"
+    """Where the clips before practice come from: "random" states of the robot, or, as in the paper, a
+    random policy that starts "standing"."""
+    pairing: str = "any"
+    """Before practice a clip is asked beside "any" moment of the demo, or beside the same "time"."""
+    choice: str = "mix"
+    """Which of the possible clips are asked: "uniform", or a "mix" of those rated highest, those that
+    the predictor's members disagree on, and any, spread over the demo."""
+    rounds: int = 10
+    """A simulated rater's first ratings come in so many rounds, with a refit after each."""
     queue: int = 12
     """Clips kept ready to be rated."""
     stale_iterations: int = 10
@@ -39,9 +50,12 @@ class RatingsConfig:
     """A simulated rater gives its online ratings evenly over this first share of the training."""
 
     def __post_init__(self) -> None:
-        _at_least(self, "ratings", pretrain=1, online=0, queue=1, stale_iterations=1)
+        _at_least(self, "ratings", pretrain=1, online=0, rounds=1, queue=1, stale_iterations=1)
         if not 0.05 <= self.clip_seconds <= 5:
             raise ValueError(f"ratings.clip_seconds must be 0.05 to 5 s, got {self.clip_seconds}")
+        _one_of("ratings.starts", self.starts, ("random", "standing"))
+        _one_of("ratings.pairing", self.pairing, ("any", "time"))
+        _one_of("ratings.choice", self.choice, ("mix", "uniform"))
         if not 0 < self.online_share <= 1:
             raise ValueError(f"ratings.online_share must be in (0, 1], got {self.online_share}")
 
@@ -67,10 +81,31 @@ class RolloutConfig:
             raise ValueError(f"rollouts.physics must be 'mujoco' or 'warp', got {self.physics!r}")
 
 
+METHODS: dict[str, dict[str, Any]] = {
+    "onedemo": {},
+    "paper": {
+        "ratings.starts": "standing",
+        "ratings.pairing": "time",
+        "ratings.choice": "uniform",
+        "ratings.rounds": 1,
+        "predictor.kind": "network",
+        "predictor.appearance": False,
+        "predictor.members": 1,
+        "practice.elastic": False,
+        "practice.bank_share": 0.0,
+        "practice.give_up": 0.0,
+        "policy.kind": "clock",
+    },
+}
+"""What each method sets where nothing else is said: the defaults are onedemo's."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RunConfig:
     """Everything that decides a run, besides the ratings."""
 
+    method: str = "onedemo"
+    """"onedemo", or "paper": the settings of Gandhi et al. 2019 (``METHODS``)."""
     seed: int = 0
     """Of every random number in the run."""
     env: str = "hopper"
@@ -82,10 +117,12 @@ class RunConfig:
     ratings: RatingsConfig = field(default_factory=RatingsConfig)
     rollouts: RolloutConfig = field(default_factory=RolloutConfig)
     predictor: PredictorConfig = field(default_factory=PredictorConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    practice: PracticeConfig = field(default_factory=PracticeConfig)
+    policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="table"))
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
 
     def __post_init__(self) -> None:
+        _one_of("method", self.method, tuple(METHODS))
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
@@ -111,14 +148,22 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
         except tomllib.TOMLDecodeError as error:
             raise UserError(f"{path} is not valid TOML: {error}") from None
     for dotted, value in (overrides or {}).items():
-        *sections, key = dotted.split(".")
-        branch = tree
-        for section in sections:
-            branch = branch.setdefault(section, {})
-            if not isinstance(branch, dict):
-                raise UserError(f"{dotted}: {section!r} is a value, not a section")
+        branch, key = _place(tree, dotted)
         branch[key] = value
+    for dotted, value in METHODS.get(str(tree.get("method")), {}).items():
+        branch, key = _place(tree, dotted)
+        branch.setdefault(key, value)
     return _build(RunConfig, tree, "")
+
+
+def _place(tree: dict[str, Any], dotted: str) -> tuple[dict[str, Any], str]:
+    """The section of a dotted key, made if missing, and the key in it."""
+    *sections, key = dotted.split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise UserError(f"{dotted}: {section!r} is a value, not a section")
+    return tree, key
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -191,6 +236,11 @@ def _fit(key: str, value: Any, hint: Any) -> Any:
     if not isinstance(value, list) or not all(type(item) is int for item in value):
         raise UserError(f"{key} must be a list of whole numbers, got {value!r}")
     return tuple(value)
+
+
+def _one_of(key: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{key} must be one of {', '.join(choices)}, got {value!r}")
 
 
 def _at_least(config: Any, section: str, **minima: int) -> None:

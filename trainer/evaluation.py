@@ -33,7 +33,10 @@ def summarise(
         ``backflip_reward`` (actions clipped to what the motors do), ``backflip_reward_raw_actions``,
         ``net_turns`` and ``clean_turns``; None where a figure cannot be had.
     """
-    episodes = evaluate(learner.policy(), learner.config.env, episodes=EPISODES, seed=_SEED)
+    episodes = evaluate(
+        learner.policy(), learner.config.env, episodes=EPISODES, seed=_SEED,
+        rules=learner.rules(EPISODES, snapshot),
+    )  # fmt: skip
     return {
         "predicted_similarity": _spread(_predicted(learner, snapshot, episodes)),
         "true_similarity": _spread(_true(oracle, episodes)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from trainer.encoders import Encoder
 from trainer.evaluation import summarise
 from trainer.files import hold
 from trainer.hidden import hidden_path, load_hidden
+from trainer.learner import Learner
 from trainer.loop import Simulated, Trainer
+from trainer.predictor import Snapshot
 from trainer.raters import Oracle, make_rater
 from trainer.records import Demo
 from trainer.runs import add_run, find_run, program_version
@@ -31,6 +34,8 @@ def train(
     rater: str = "oracle",
     name: str | None = None,
     progress: bool = True,
+    cache_dir: Path | None = None,
+    watch: Callable[[Learner, Snapshot], None] | None = None,
 ) -> dict[str, Any]:
     """Trains with a simulated rater from the first rating to the last step.
 
@@ -43,6 +48,8 @@ def train(
         rater: Name of the simulated rater, see ``trainer.raters.make_rater``.
         name: Of the run; an unfinished run of that name goes on.
         progress: Show a progress bar on standard error.
+        cache_dir: Holds what is known of demos and robots; the data directory if None.
+        watch: Called with learner and snapshot after each iteration, for a learning curve.
 
     Returns:
         The summary, ready for JSON: ratings, figures over 16 episodes of the final policy, costs.
@@ -60,7 +67,7 @@ def train(
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
-        simulated=Simulated(name=rater, rate=simulated.rate),
+        simulated=Simulated(name=rater, rate=simulated.rate), cache_dir=cache_dir, watch=watch,
     )  # fmt: skip
     try:
         with hold(trainer.directory / "lock"):

@@ -14,18 +14,31 @@ from typing import Any
 
 import numpy as np
 
-from trainer import envs
+from trainer import body, envs
+from trainer.appearance import Track
+from trainer.choice import Question, choose
 from trainer.config import RunConfig
 from trainer.errors import UserError
 from trainer.policy import Policy, PolicySnapshot, check_device
-from trainer.predictor import FitStats, Snapshot, fit, visual_inputs
+from trainer.practice import PracticeRules, fill_bank
+from trainer.predictor import FitStats, Snapshot, View, fit, visual_inputs
 from trainer.records import Segment
-from trainer.rollouts import Collector, Transitions
+from trainer.rollouts import Collector, EpisodeRules, Transitions
+from trainer.starts import wild_rollouts
 from trainer.store import RatedSegment
 from trainer.timing import frame_of_step
 from trainer.trpo import Trpo
 
 _RANDOM_LANES = 16
+_WILD_LANES = 64
+_WILD_SECONDS = 0.96
+"""How long random states run on before the next."""
+_AHEAD_SECONDS = (0.0, 0.13, 0.33)
+"""The policy sees the demo as it is now and so far ahead (policy.kind = "table")."""
+_JUDGED_EVERY = 4
+"""Control steps between those that are looked at to choose a clip."""
+_TABLE_DIMS = 2 * body.POSE
+"""Numbers of each of them: pose and motion where they are known, else principal components."""
 _DEVICE_LANES = 1024
 """From so many lanes on an accelerator acts itself; with fewer the way there and back costs more."""
 
@@ -50,39 +63,49 @@ class Learner:
         self.demo_steps, self.clip_steps = lengths(config, frames, fps)
         self.iteration = 0
         self.env_steps = 0
-        self._visual: np.ndarray | None = None
+        self._view: View | None = None
         self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
-        self._policy = Policy(
-            config.policy,
-            obs_size=spec.obs_size,
-            action_size=spec.action_size,
-            horizon=self.demo_steps,
-            seed=config.seed,
-        ).to(config.device)
+        self._policy = self._make_policy().to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
         self._acts_on_device = config.device != "cpu" and config.rollouts.lanes >= _DEVICE_LANES
-        self._collector = self._make_collector(config.rollouts.lanes, seed=config.seed, stagger=True)
+        self._rules = self.rules(config.rollouts.lanes)
+        self._collector = self._make_collector(
+            config.rollouts.lanes, seed=config.seed, stagger=True, rules=self._rules
+        )
+        self._banked = 0  # number of the snapshot that chose the present bank
+        self._wild: Transitions | None = None
 
-    def look_at(self, features: np.ndarray) -> None:
-        """Takes in the demo's frame features, (F, D). Random rollouts and clips need none; fits do."""
-        self._visual = visual_inputs(features, self.config.predictor.visual_dims)
+    def look_at(self, features: np.ndarray, track: Track | None = None) -> None:
+        """Takes in the demo. Random rollouts and clips need none of it; fits do.
+
+        Args:
+            features: Features of its frames, (F, D).
+            track: What the frames show of the robot; None if that is not known.
+        """
+        self._view = View(visual=visual_inputs(features, self.config.predictor.visual_dims), track=track)
+        if self.config.policy.kind == "table":
+            if track is not None:
+                shown = np.concatenate([track.pose, track.motion], axis=-1)
+            else:
+                shown = visual_inputs(features, _TABLE_DIMS)
+                shown = np.pad(shown, ((0, 0), (0, _TABLE_DIMS - shown.shape[1])))
+            self._policy.table = self._ahead(shown)
 
     def policy(self) -> PolicySnapshot:
         """The current policy, as a copy that any thread may use."""
         return self._policy.snapshot()
 
     def random_rollouts(self) -> Transitions:
-        """Whole episodes of the untrained policy, which is its noise: the same for the same seed."""
+        """What the robot does at random, the same for the same seed: clips to rate before there is a policy.
+
+        With ``ratings.starts = "random"`` random actions in random states; else whole episodes of the
+        untrained policy, which is its noise, from standing.
+        """
         config = self.config
-        policy = Policy(
-            config.policy,
-            obs_size=self._policy.obs_size,
-            action_size=self._policy.action_size,
-            horizon=self.demo_steps,
-            seed=config.seed,
-        )
+        if config.ratings.starts == "random":
+            return self._wild_rollouts()
         collector = self._make_collector(_RANDOM_LANES, seed=config.seed + 1, stagger=False)
-        return collector.collect(policy.snapshot(), self.demo_steps)
+        return collector.collect(self._make_policy().snapshot(), self.demo_steps)
 
     def frames_of(self, demo_steps: np.ndarray) -> np.ndarray:
         """The demo frame on screen at control steps, which may lie past the end: same shape."""
@@ -94,16 +117,41 @@ class Learner:
         Raises:
             ValueError: If there is none.
         """
-        assert self._visual is not None, "look_at comes before fit"
+        assert self._view is not None, "look_at comes before fit"
         steps = np.array([r.demo_step for r in ratings])[:, None] + np.arange(self.clip_steps)
         return fit(
             ratings,
             self.frames_of(steps),
-            self._visual,
+            self._view,
             self.config.predictor,
             number=number,
             seed=self.config.seed,
             device=self.config.device,
+        )
+
+    def choose(
+        self, rollouts: Transitions, snapshot: Snapshot | None, count: int, rng: np.random.Generator
+    ) -> list[Question]:
+        """Chooses clips of rollouts to be rated, by the run's settings (``trainer/choice.py``)."""
+        config = self.config.ratings
+
+        def judge(
+            lanes: np.ndarray, starts: np.ndarray, demo_steps: np.ndarray
+        ) -> tuple[np.ndarray, np.ndarray]:
+            assert snapshot is not None
+            span = np.arange(0, self.clip_steps, _JUDGED_EVERY)
+            cut = (lanes[:, None], starts[:, None] + span)
+            frames = self.frames_of(demo_steps[:, None] + span)
+            return snapshot.judge(frames, rollouts.obs[cut], rollouts.actions[cut])
+
+        return choose(
+            rollouts,
+            count,
+            self.clip_steps,
+            self.demo_steps,
+            rng,
+            any_time=config.pairing == "any" and self.iteration == 0,
+            judge=judge if config.choice == "mix" and snapshot is not None else None,
         )
 
     def predict(self, snapshot: Snapshot, segment: Segment, demo_step: int) -> float:
@@ -121,12 +169,19 @@ class Learner:
         left = -(-(sizes.total_steps - self.env_steps) // sizes.lanes)
         steps = max(1, min(sizes.steps, left))
         policy = self._policy.snapshot(on_device=self._acts_on_device)
-        rollouts = self._collector.collect(policy, steps)
-        rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
+        if isinstance(self._rules, PracticeRules):
+            self._use(snapshot, self._rules)
+            rollouts = self._collector.collect(policy, steps)
+            rewards = self._rules.take_rewards()
+            predicted = 1 + 4 * self._rules.mean_similarity
+        else:
+            rollouts = self._collector.collect(policy, steps)
+            rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
+            predicted = float(rewards.mean())
         stats = self._trpo.update(rollouts, rewards)
         self.iteration += 1
         self.env_steps += rollouts.clock.size
-        return rollouts, {"predicted": float(rewards.mean()), **asdict(stats)}
+        return rollouts, {"predicted": predicted, **asdict(stats)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs besides config, demo and ratings, for ``torch.save``."""
@@ -136,6 +191,7 @@ class Learner:
             "policy": self._policy.state_dict(),
             "trpo": self._trpo.state_dict(),
             "collector": self._collector.state_dict(),
+            "rules": self._rules.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -145,8 +201,63 @@ class Learner:
         self._policy.load_state_dict(state["policy"])
         self._trpo.load_state_dict(state["trpo"])
         self._collector.load_state_dict(state["collector"])
+        self._rules.load_state_dict(state.get("rules", {}))
 
-    def _make_collector(self, lanes: int, *, seed: int, stagger: bool) -> Collector:
+    def rules(self, lanes: int, snapshot: Snapshot | None = None) -> EpisodeRules:
+        """How the demo's clock moves in episodes of so many lanes; for evaluation and for the live view.
+
+        Args:
+            lanes: N.
+            snapshot: What similarity is; needed before the rules of an elastic clock can be used.
+        """
+        practice = self.config.practice
+        if practice.plain:
+            return EpisodeRules()
+        rules = PracticeRules(
+            practice, lanes=lanes, dt=self.dt, demo_steps=self.demo_steps, frames_of=self.frames_of
+        )
+        if snapshot is not None:
+            rules.use(snapshot, None)
+        return rules
+
+    def _use(self, snapshot: Snapshot, rules: PracticeRules) -> None:
+        """Lets practice follow a snapshot; a new one chooses a new bank, the same after a resume."""
+        if snapshot.number == self._banked:
+            return
+        bank = None
+        if self.config.practice.bank_share:
+            self._wild = self._wild or self._wild_rollouts()
+            rng = np.random.default_rng([self.config.seed, snapshot.number])
+            bank = fill_bank(snapshot, self._wild, self.frames_of, self.demo_steps, rng)
+        rules.use(snapshot, bank)
+        self._banked = snapshot.number
+
+    def _wild_rollouts(self) -> Transitions:
+        config, every = self.config, round(_WILD_SECONDS / self.dt)
+        return wild_rollouts(
+            config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
+            nthread=config.rollouts.threads,
+        )  # fmt: skip
+
+    def _make_policy(self) -> Policy:
+        spec, config = envs.spec(self.config.env), self.config.policy
+        table = None
+        if config.kind == "table":  # filled in ``look_at``
+            table = np.zeros((self.demo_steps, len(_AHEAD_SECONDS) * _TABLE_DIMS))
+        return Policy(
+            config, obs_size=spec.obs_size, action_size=spec.action_size, horizon=self.demo_steps,
+            seed=self.config.seed, table=table,
+        )  # fmt: skip
+
+    def _ahead(self, shown: np.ndarray) -> np.ndarray:
+        """What the policy sees at each demo step: frames (F, k) now and ahead, (H, 3 k)."""
+        steps = np.arange(self.demo_steps)
+        ahead = [self.frames_of(steps + round(seconds / self.dt)) for seconds in _AHEAD_SECONDS]
+        return np.concatenate([shown[frames] for frames in ahead], axis=-1)
+
+    def _make_collector(
+        self, lanes: int, *, seed: int, stagger: bool, rules: EpisodeRules | None = None
+    ) -> Collector:
         rollouts = self.config.rollouts
         env = envs.make(
             self.config.env,
@@ -155,7 +266,7 @@ class Learner:
             nthread=rollouts.threads,
             physics=rollouts.physics,
         )
-        return Collector(env, seed=seed, stagger=stagger)
+        return Collector(env, seed=seed, stagger=stagger, rules=rules)
 
 
 def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:

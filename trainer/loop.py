@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer.choice import choose
+from trainer.appearance import learn as learn_appearance
 from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
@@ -69,6 +69,8 @@ class Trainer:
         encoder: Looks at the demo's frames, once.
         renderer: Draws clips for people; None if nobody looks.
         simulated: Answers in place of people; None for people.
+        cache_dir: Holds what is known of demos and robots for any run; the data directory if None.
+        watch: Called in the trainer's thread after each iteration.
     """
 
     def __init__(
@@ -82,9 +84,13 @@ class Trainer:
         encoder: Encoder,
         renderer: RenderThread | None = None,
         simulated: Simulated | None = None,
+        cache_dir: Path | None = None,
+        watch: Callable[[Learner, Snapshot], None] | None = None,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
+        self.cache_dir = cache_dir or data_dir
+        self._watch = watch
         self.directory = data_dir / "runs" / run
         self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
         self._learner: Learner | None = None
@@ -194,7 +200,7 @@ class Trainer:
             elif learner.iteration == 0 and self._ratings() < self.config.ratings.pretrain:
                 self._tell("pretrain", "The robot moves at random until it has learned from your ratings.")
                 self._work_began = time.monotonic()
-                if self._refit(learner, at_least=_PRETRAIN_REFIT):
+                if self._refit(learner, at_least=_PRETRAIN_REFIT if self._simulated is None else 1):
                     self._work_s = time.monotonic() - self._work_began
                 self._stop.wait(_TICK_S)
             else:
@@ -224,8 +230,14 @@ class Trainer:
         if self._simulated is None:
             self._ask(learner)  # people rate while the encoder looks at the demo, seconds the first time
         torch.set_num_threads(self.config.rollouts.threads)
-        learner.look_at(demo_features(self.demo, self._encoder, self.data_dir / "demos"))
+        features = demo_features(self.demo, self._encoder, self.cache_dir / "demos")
+        look = None
+        if self.config.predictor.appearance:
+            self._tell("starting", "Looking at pictures of the robot, once: about a minute.")
+            look = learn_appearance(self.config.env, self._encoder, self.cache_dir / "robots")
         torch.set_num_threads(1)
+        track = look.track(features, self.demo.fps) if look is not None and look.knows(features) else None
+        learner.look_at(features, track)
         return learner
 
     def _iterate(self, learner: Learner) -> None:
@@ -246,6 +258,8 @@ class Trainer:
         write_atomic(self.directory / "checkpoint.pt", buffer.getvalue())
         self.store.add_iteration(self.run, learner.iteration, **row)
         self._withdraw_stale(learner)
+        if self._watch is not None:
+            self._watch(learner, snapshot)
         self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
 
     def _refit(self, learner: Learner, at_least: int) -> bool:
@@ -303,9 +317,7 @@ class Trainer:
             return False
         # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
         seed = [self.config.seed, learner.iteration, self.store.count_clips(self.run)]
-        questions = choose(
-            self._pool, missing, learner.clip_steps, learner.demo_steps, np.random.default_rng(seed)
-        )
+        questions = learner.choose(self._pool, self._snapshot, missing, np.random.default_rng(seed))
         new = []
         for question in questions:
             segment = self._pool.segment(question.lane, question.start, learner.clip_steps)
@@ -340,8 +352,11 @@ class Trainer:
     def _due(self, learner: Learner) -> int:
         """Ratings that a simulated rater has been asked for by now, in all."""
         ratings = self.config.ratings
-        if learner.iteration == 0:
-            return ratings.pretrain
+        if (
+            learner.iteration == 0
+        ):  # a round, a fit, the next round: later ones are chosen by what was learned
+            done = self._snapshot.number if self._snapshot else 0
+            return round(ratings.pretrain * min(1.0, (done + 1) / ratings.rounds))
         span = ratings.online_share * self.config.rollouts.total_steps
         return ratings.pretrain + round(ratings.online * min(1.0, learner.env_steps / span))
 

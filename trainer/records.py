@@ -75,7 +75,7 @@ class Rollouts:
     qvel: np.ndarray
     """Velocities, (N, T, v), float64."""
     clock: np.ndarray
-    """Control steps since the episode began, (N, T), int32: the demo step that belongs to the state."""
+    """The demo step that belongs to the state, (N, T), int32."""
     inputs: np.ndarray
     """Normalised policy inputs, (N, T, i), float32."""
     next_inputs: np.ndarray
@@ -96,7 +96,7 @@ class Rollouts:
         stop = start + length
         if not (0 <= start and stop <= self.obs.shape[1]):
             raise ValueError(f"steps {start}..{stop} are outside 0..{self.obs.shape[1]}")
-        if self.clock[lane, stop - 1] - self.clock[lane, start] != length - 1:
+        if (self.terminated | self.truncated)[lane, start : stop - 1].any():
             raise ValueError(f"steps {start}..{stop} of lane {lane} span the end of an episode")
         cut = (lane, slice(start, stop))
         return Segment(

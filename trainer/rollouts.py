@@ -11,7 +11,7 @@ f policy inputs, K lanes that restart.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -107,6 +107,30 @@ class EpisodeRules:
         """True where the episode is given up, as a terminal state, (N,)."""
         return np.zeros(len(step.clock), bool)
 
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed training needs of the rules, for ``torch.save``."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on where ``state_dict`` was taken."""
+
+
+class Actor(Protocol):
+    """What acts: a ``PolicySnapshot``, or plain noise."""
+
+    @property
+    def mean(self) -> np.ndarray:
+        """One number for each of its inputs, (f,)."""
+        ...
+
+    def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
+        """What it sees of observations (N, o) at demo steps (N,): (N, f), float32."""
+        ...
+
+    def act(self, inputs: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
+        """Actions, (N, a)."""
+        ...
+
 
 class Collector:
     """Steps a batched environment with a policy, batch after batch.
@@ -134,7 +158,7 @@ class Collector:
         self._clock = np.zeros(env.num_envs, np.int32)
         self._begin(np.arange(env.num_envs))
 
-    def collect(self, policy: PolicySnapshot, steps: int, *, deterministic: bool = False) -> Transitions:
+    def collect(self, policy: Actor, steps: int, *, deterministic: bool = False) -> Transitions:
         """Goes on for T control steps in every lane.
 
         Args:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from importlib.metadata import version
 from itertools import count
@@ -48,7 +49,7 @@ def find_run(
     file = data_dir / "runs" / run["id"] / "config.toml"
     if not file.exists():  # lost with the directory; the database has it too
         write_atomic(file, run["config"].encode())
-    config = load_config(file)
+    config = load_config(file, _of_before(file))
     if wanted is not None:  # where it computes is no part of what a run is
         config = replace(config, device=wanted.device)
     if wanted is not None and wanted != config:
@@ -57,6 +58,11 @@ def find_run(
             "use the same or none, or start a new run with --new-run"
         )
     return run["id"], config
+
+
+def _of_before(file: Path) -> dict[str, str]:
+    """What a config of before there were two methods leaves out: those runs are the paper's."""
+    return {} if re.search(r"^method = ", file.read_text(), re.MULTILINE) else {"method": "paper"}
 
 
 def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name: str | None) -> str:

@@ -1,0 +1,246 @@
+"""The paper's similarity predictor: the two-branch network of its figure 2.
+
+Frame features enter one branch, state and action go through two fully connected ReLU layers in the
+other; both are concatenated and pass a fully connected layer, one additional fully connected layer and
+a softmax over the five ratings. It is trained on single (frame, state-action) pairs, each with the
+rating of its clip, with batches that hold equally many pairs of each rating.
+
+Shapes: n clips, W control steps a clip, F demo frames, V visual dims, S = 15 standard dims.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from trainer.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from trainer.store import RatedSegment
+
+STANDARD_DIMS = 15
+_JUDGED_CLIPS = 2000
+"""Clips behind ``FitStats.accuracy``, at most: a refit must not grow with the ratings."""
+_BOOTSTRAP = 0.85
+"""Share of the clips that each of several members sees."""
+
+
+def standard_inputs(obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """State and action as the predictor sees them.
+
+    The torso angle enters as sine and cosine, because a robot after one turn looks as before it;
+    velocities are scaled to the size of the rest; actions are clipped to what the motors apply.
+
+    Args:
+        obs: Observations, (..., 11).
+        actions: Actions, (..., 3).
+
+    Returns:
+        (..., S), float32.
+    """
+    angle = obs[..., 1:2]
+    parts = (
+        obs[..., :1],
+        np.sin(angle),
+        np.cos(angle),
+        obs[..., 2:5],
+        0.2 * obs[..., 5:],
+        np.clip(actions, -1, 1),
+    )
+    return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+class SimilarityNet(nn.Module):
+    """The two-branch network. Concatenation and the layer after it are written as a sum of two maps.
+
+    ``W [v; s] + b = W_v v + (W_s s + b)``: the same function, but the visual part depends on the
+    frame alone and can be worked out once per demo.
+    """
+
+    def __init__(self, visual_dims: int, config: PredictorConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        hidden = config.hidden
+        self.standard = nn.Sequential(
+            _linear(STANDARD_DIMS, hidden), nn.ReLU(), _linear(hidden, hidden), nn.ReLU()
+        )
+        self.fuse_visual = _linear(visual_dims, hidden, bias=False)
+        self.fuse_standard = _linear(hidden, hidden)
+        layers: list[nn.Module] = [nn.ReLU()]
+        if config.additional_layer:
+            layers += [_linear(hidden, hidden), nn.ReLU()]
+        self.head = nn.Sequential(*layers, _linear(hidden, CLASSES))
+        for module in self.modules():
+            if isinstance(module, nn.Linear):
+                bound = module.in_features**-0.5
+                nn.init.uniform_(module.weight, -bound, bound, generator=generator)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+
+    def forward(self, visual: torch.Tensor, standard: torch.Tensor) -> torch.Tensor:
+        """Logits of the five ratings, (..., 5), for visual (..., V) and standard inputs (..., S)."""
+        return self.head(self.fuse_visual(visual) + self.fuse_standard(self.standard(standard)))
+
+
+class NetworkSnapshot(Snapshot):
+    """One or more fitted networks.
+
+    Args:
+        number: 1, 2, ... within a run.
+        config: How they were fitted.
+        nets: The networks; not to be changed afterwards.
+        visual: Visual inputs of the demo's frames, (F, V).
+        mean: Mean of the standard inputs they were fitted on, (S,).
+        std: Their standard deviation, (S,).
+    """
+
+    def __init__(
+        self, *, number: int, config: PredictorConfig, nets: Sequence[SimilarityNet], visual: np.ndarray,
+        mean: np.ndarray, std: np.ndarray,
+    ) -> None:  # fmt: skip
+        super().__init__(number=number, config=config)
+        self._nets = [net.eval().requires_grad_(False) for net in nets]
+        self._visual = visual
+        self._mean, self._std = mean, std
+        self._device = nets[0].fuse_visual.weight.device
+        seen = torch.from_numpy(visual).to(self._device)
+        self._folded = [net.fuse_visual(seen) for net in self._nets]
+
+    def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """As ``Snapshot.member_probabilities``."""
+        inputs = torch.from_numpy((standard_inputs(obs, actions) - self._mean) / self._std).to(self._device)
+        index = torch.from_numpy(np.ascontiguousarray(frames).astype(np.int64)).to(self._device)
+        with torch.inference_mode():
+            members = []
+            for net, folded in zip(self._nets, self._folded, strict=True):
+                fused = net.fuse_standard(net.standard(inputs)) + folded[index]
+                members.append(functional.softmax(net.head(fused), dim=-1).cpu().numpy())
+        return np.stack(members)
+
+    def tensors(self) -> dict[str, Any]:
+        """Weights and scales."""
+        return {
+            "nets": [{name: x.cpu() for name, x in net.state_dict().items()} for net in self._nets],
+            "visual": torch.from_numpy(self._visual),
+            "mean": torch.from_numpy(self._mean),
+            "std": torch.from_numpy(self._std),
+        }
+
+
+def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> NetworkSnapshot:
+    """The snapshot whose ``tensors`` are in ``data``."""
+    nets = []
+    for weights in data["nets"] if "nets" in data else [data["net"]]:
+        net = SimilarityNet(data["visual"].shape[1], config, torch.Generator())
+        net.load_state_dict(weights)
+        nets.append(net.to(device))
+    return NetworkSnapshot(
+        number=data["number"], config=config, nets=nets, visual=data["visual"].numpy(),
+        mean=data["mean"].numpy(), std=data["std"].numpy(),
+    )  # fmt: skip
+
+
+def fit(
+    ratings: Sequence[RatedSegment], frames: np.ndarray, view: View, config: PredictorConfig,
+    *, number: int, seed: int, device: str = "cpu",
+) -> tuple[NetworkSnapshot, FitStats]:  # fmt: skip
+    """Fits ``config.members`` networks. Arguments and result as ``predictor.fit``."""
+    generator = torch.Generator().manual_seed(seed)
+    obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
+    inputs = standard_inputs(obs, actions)
+    mean, std = inputs.mean(axis=(0, 1)), inputs.std(axis=(0, 1)) + 0.05
+    standard_nWS = torch.from_numpy((inputs - mean) / std).to(device)
+    # Looked up frame by frame: with many ratings the visual inputs of all pairs would fill the memory.
+    frames_nW = torch.from_numpy(frames.astype(np.int64)).to(device)
+    visual_FV = torch.from_numpy(view.visual).to(device)
+    classes_n = torch.tensor([r.value - 1 for r in ratings])
+    nets, losses = [], []
+    for _ in range(config.members):
+        net, loss = _fit_one(standard_nWS, frames_nW, visual_FV, classes_n, config, generator, device)
+        nets.append(net)
+        losses.append(loss)
+    snapshot = NetworkSnapshot(
+        number=number, config=config, nets=nets, visual=view.visual, mean=mean, std=std
+    )
+    some = slice(None, None, -(-len(ratings) // _JUDGED_CLIPS))
+    chosen = snapshot.probabilities(frames[some], obs[some], actions[some]).mean(axis=1).argmax(axis=-1)
+    hit = float((chosen == classes_n[some].numpy()).mean())
+    return snapshot, FitStats(loss=float(np.mean(losses)), accuracy=hit)
+
+
+def _fit_one(
+    standard_nWS: torch.Tensor, frames_nW: torch.Tensor, visual_FV: torch.Tensor, classes_n: torch.Tensor,
+    config: PredictorConfig, generator: torch.Generator, device: str,
+) -> tuple[SimilarityNet, float]:  # fmt: skip
+    """One network, and its mean loss over the last tenth of the updates."""
+    net = SimilarityNet(visual_FV.shape[1], config, generator).to(device)
+    optimiser = torch.optim.SGD(
+        net.parameters(), lr=config.learning_rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
+    )
+    counts = torch.bincount(classes_n, minlength=CLASSES)
+    weights = class_weights(counts).to(device) if config.class_weights else None
+    chance_n = (1.0 / counts[classes_n]) if config.sampling == "equal" else torch.ones(len(classes_n))
+    if config.members > 1:
+        seen_n = torch.rand(len(classes_n), generator=generator) < _BOOTSTRAP
+        chance_n = torch.where(seen_n, chance_n, 0.0) if seen_n.any() else chance_n
+    clips, pairs = config.updates * config.batch_clips, config.pairs_per_clip
+    drawn = torch.multinomial(chance_n, clips, replacement=True, generator=generator)
+    steps = torch.randint(standard_nWS.shape[1], (clips, pairs), generator=generator)
+    drawn, steps = drawn.to(device), steps.to(device)
+    targets_n5 = _targets(classes_n, config.ordinal).to(device)
+    losses = []
+    for update, (clip, step) in enumerate(
+        zip(drawn.split(config.batch_clips), steps.split(config.batch_clips), strict=True)
+    ):
+        # The learning rate falls to 0 along half a cosine (Loshchilov and Hutter 2017, eq. 5).
+        fall = 0.5 * (1 + math.cos(math.pi * update / config.updates))
+        optimiser.param_groups[0]["lr"] = config.learning_rate * fall
+        pair = (clip[:, None], step)
+        logits = net(visual_FV[frames_nW[pair]], standard_nWS[pair]).flatten(0, 1)
+        target = targets_n5[clip].repeat_interleave(pairs, dim=0)
+        target = target if config.ordinal else target.argmax(dim=-1)
+        loss = functional.cross_entropy(logits, target, weight=weights)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.detach())
+    return net, float(torch.stack(losses[-max(1, config.updates // 10) :]).mean())
+
+
+def _targets(classes_n: torch.Tensor, ordinal: bool) -> torch.Tensor:
+    """Probability of each rating that the loss asks for, (n, 5).
+
+    Ordinal: it falls by a factor with each step away from the rating given (the soft labels of Diaz and
+    Marathe 2019, with the distance between ranks as the metric).
+    """
+    if not ordinal:
+        return functional.one_hot(classes_n, CLASSES).float()
+    away = (torch.arange(CLASSES)[None] - classes_n[:, None]).abs().float()
+    return functional.softmax(-_ORDINAL_FALL * away, dim=-1)
+
+
+_ORDINAL_FALL = 1.5
+
+
+def class_weights(counts: torch.Tensor) -> torch.Tensor:
+    """Weight of each class in the loss: the inverse of its share, at most 10; 0 for an absent class.
+
+    Args:
+        counts: Ratings of each class, (5,).
+
+    Returns:
+        (5,), float32.
+    """
+    present = counts > 0
+    weights = counts.sum() / (present.sum() * counts.clamp(min=1).float())
+    return torch.where(present, weights, torch.zeros(())).clamp(max=10.0)
+
+
+def _linear(inputs: int, outputs: int, bias: bool = True) -> nn.Linear:
+    """A layer without values yet: the usual initialisation would draw from torch's global generator."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
+    assert isinstance(layer, nn.Linear)
+    return layer
