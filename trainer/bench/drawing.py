@@ -1,7 +1,7 @@
 """Charts of reports, as SVG. The same chart gives the same bytes.
 
 Text stays text, in the fonts of the page it is shown on. Lines are named where they end, in their colour,
-so that nobody has to look from a legend to a line and back.
+so that nobody has to look from a legend to a line and back; a narrow chart has its names underneath.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from trainer.bench.document import Bars, Chart, Line, number
+from trainer.bench.blocks import Bars, Chart, Line, number
 
 COLOURS = ("#2f5dc4", "#d97a1d", "#0d8a72", "#9a4fb5", "#c23b55", "#5b7f1f", "#1f7fa8", "#8a6a3a")
 MUTED = "#8a94a3"
 """For what is only there to compare with."""
 
 _INK, _QUIET, _GRID = "#1c2430", "#566173", "#e3e7ed"
-_WIDE, _HALF = (7.6, 4.1), (4.3, 3.0)
+_WIDE, _HALF = (7.6, 4.1), (4.3, 3.3)
 """Inches of 72 points."""
 _MOST_TICKS = 6
 _FONT = "DejaVu Sans"
 """Comes with matplotlib, so that a chart is laid out alike everywhere; it is wider than what is shown."""
 _PAGE_FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, Helvetica, Arial, sans-serif"
-_STYLE = {
+_STYLE: Any = {
     "font.family": [_FONT],
     "font.size": 9,
     "svg.fonttype": "none",
@@ -58,7 +59,7 @@ _STYLE = {
 
 def draw(chart: Chart | Bars) -> bytes:
     """The chart as SVG."""
-    with matplotlib.rc_context({**_STYLE, "svg.hashsalt": chart.name}):
+    with matplotlib.rc_context(_STYLE | {"svg.hashsalt": chart.name}):
         figure = _bars(chart) if isinstance(chart, Bars) else _chart(chart)
         file = io.BytesIO()
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
@@ -85,8 +86,15 @@ def _chart(chart: Chart) -> Figure:
     axes.set_title(chart.title, fontsize=11 if chart.wide else 10)
     axes.set(xlabel=chart.x_label, ylabel=chart.y_label)
     axes.grid(axis="y")
-    if len(named) > 1:
+    if len(named) > 1 and chart.wide:
         _name_ends(axes, named, height=size[1] * 72 - 75)
+    elif len(named) > 1:
+        keys = [Line2D([], [], color=colour, linewidth=2) for _, _, colour in named]
+        labels = [label for label, _, _ in named]
+        figure.legend(
+            keys, labels, loc="outside lower left", ncols=1 + (max(map(len, labels)) < 22), frameon=False,
+            fontsize=8.5, handlelength=1, labelcolor="linecolor",
+        )  # fmt: skip
     return figure
 
 

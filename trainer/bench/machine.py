@@ -34,15 +34,12 @@ def machine() -> dict[str, Any]:
     }
 
 
-def commit() -> str | None:
-    """The commit of the source tree, ending in "-dirty" if it was changed since; None if it is not one."""
-    if not (_ROOT / ".git").exists():  # an installed package, perhaps inside somebody else's repository
-        return None
-    command = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=10"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
+def program() -> dict[str, Any]:
+    """``version`` of onedemo, and ``commit`` of its source tree: None if it is not in one.
+
+    The commit ends in "-dirty" if something was changed since.
+    """
+    return {"version": version("onedemo"), "commit": _commit()}
 
 
 def now() -> str:
@@ -56,3 +53,13 @@ def _processor() -> str:
         return next(line.split(": ", 1)[1] for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or "unknown"
+
+
+def _commit() -> str | None:
+    if not (_ROOT / ".git").exists():  # an installed package, perhaps inside somebody else's repository
+        return None
+    command = ["git", "-C", str(_ROOT), "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

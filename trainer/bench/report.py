@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from trainer.bench import document
-from trainer.bench.document import Block, Bullets, Chart, Document, Heading, Line, Table, Text
+from trainer.bench.blocks import Block, Bullets, Chart, Document, Heading, Line, Table, Text, number
+from trainer.bench.document import about, text_table, write
 from trainer.bench.figures import Figure, Growth, Result, Skipped
 
 
@@ -26,7 +26,7 @@ def as_json(results: Sequence[Result], *, command: str, seconds: float) -> dict[
     """
     figures = [result for result in results if isinstance(result, Figure)]
     return {
-        **document.about(command=command, seconds=seconds),
+        **about(command=command, seconds=seconds),
         "ratios": {f.name: _round(f.value) for f in figures if f.unit == "x"},
         "figures": {f.name: {**asdict(f), "met": f.met} for f in figures},
         "growth": {g.name: asdict(g) for g in results if isinstance(g, Growth)},
@@ -41,7 +41,7 @@ def table(results: Sequence[Result]) -> str:
         for figure in results
         if isinstance(figure, Figure)
     ]
-    lines = [document.text_table(("", "median", "least - most", "reach", ""), rows)]
+    lines = [text_table(("", "median", "least - most", "reach", ""), rows)]
     lines += [f"{skip.name}: {_why(skip)}" for skip in results if isinstance(skip, Skipped)]
     return "\n".join(lines)
 
@@ -58,7 +58,7 @@ def write_report(out: Path, title: str, results: Sequence[Result], about: dict[s
     Raises:
         ImportError: If matplotlib (extra ``[bench]``) is missing and there is a growth to draw.
     """
-    document.write(Document(title=title, about=about, blocks=_blocks(results)), out)
+    write(Document(title=title, about=about, blocks=_blocks(results)), out)
 
 
 def _blocks(results: Sequence[Result]) -> list[Block]:
@@ -98,11 +98,11 @@ def _label(figure: Figure) -> str:
 
 
 def _value(value: float, unit: str) -> str:
-    return f"{document.number(value)} {unit}"
+    return f"{number(value)} {unit}"
 
 
 def _spread(figure: Figure) -> str:
-    return f"{document.number(figure.low)} - {document.number(figure.high)}"
+    return f"{number(figure.low)} - {number(figure.high)}"
 
 
 def _reach(figure: Figure) -> tuple[str, str]:

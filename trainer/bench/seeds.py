@@ -8,27 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.document import Line, number
+from trainer.bench.blocks import Line, number
 from trainer.bench.study import Outcome
-
-REPORTING = 5
-"""Seeds 0 to 4 are reported; settings are tuned on others."""
-TUNING_FROM = 100
-"""Settings are tuned on seeds from here on, which no table reports."""
-
-
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """Seeds as typed: "5" is 0 to 4, "3,7,9" those, "7," seed 7 alone.
-
-    Raises:
-        ValueError: If it is neither a number of at least 1 nor a list of different numbers.
-    """
-    numbers = [int(part) for part in text.split(",") if part.strip()]
-    if "," not in text:
-        numbers = list(range(numbers[0])) if numbers else []
-    if not numbers or min(numbers) < 0 or len(set(numbers)) < len(numbers):
-        raise ValueError(f"must be how many seeds, or a list of different ones such as 3,7,9; got {text!r}")
-    return tuple(numbers)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,7 +34,7 @@ class Spread:
         return sum(value is not None and value >= least for value in self.values)
 
     def __str__(self) -> str:
-        """"mean ± deviation", with what is missing; "not run" if everything is."""
+        """Mean ± deviation and how many seeds are missing; "not run" if all are."""
         seeds = len(self.values)
         if self.missing == seeds:
             return "not run"

@@ -124,7 +124,7 @@ class Outcome:
 
     @property
     def state(self) -> str:
-        """"done", "not run" or "failed: ..." in one line."""
+        """One line: "done", "not run" or "failed: ..."."""
         if self.kept is not None:
             return "done"
         return f"failed: {self.reason.splitlines()[-1]}" if self.failed else self.reason
@@ -313,7 +313,9 @@ def _start(job: Job, results: Path) -> _Child | Outcome | None:
             stdout=log,
             stderr=log,
             # It finds what this process finds, a program started from a source tree included.
-            env=os.environ | _ONE_THREAD | {"PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
+            env=os.environ
+            | _ONE_THREAD
+            | {"PYTHONPATH": os.pathsep.join(p or os.getcwd() for p in sys.path)},
             start_new_session=True,
         )
         return _Child(job, process, log, lock_file, stack.pop_all())

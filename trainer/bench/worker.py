@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.bench.document import plain
-from trainer.bench.machine import commit, machine, now
+from trainer.bench.machine import machine, now, program
 from trainer.files import write_atomic
 
 
@@ -33,7 +33,7 @@ def main(request_json: str) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     scratch = Path(tempfile.mkdtemp(prefix=f".{file.stem}-", dir=file.parent))
     threading.Thread(target=_end_with_parent, args=(scratch,), daemon=True).start()
-    source = commit()  # before the work: somebody may edit meanwhile
+    source = program()  # before the work: somebody may edit meanwhile
     try:
         run = find_function(request.pop("function"))
         began, began_cpu = time.monotonic(), time.process_time()
@@ -41,12 +41,9 @@ def main(request_json: str) -> None:
         wall_s, cpu_s = time.monotonic() - began, time.process_time() - began_cpu
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    from trainer.runs import program_version
-
     kept = {
         **request,
-        "version": program_version(),
-        "commit": source,
+        **source,
         "date": now(),
         "wall_s": round(wall_s, 2),
         "cpu_s": round(cpu_s, 2),
