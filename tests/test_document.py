@@ -115,8 +115,8 @@ def test_numbers():
     assert [number(x) for x in (0, 0.12345, 12.345, 999.6, 1234567.8, -2.5)] == [
         "0", "0.123", "12.3", "1000", "1,234,568", "-2.5",
     ]  # fmt: skip
-    rows = [(1.0, "x", ">= 2", "", "12 s"), (None, "2", "3 - 4", "", "not run")]
-    assert numeric_columns("abcde", rows) == [True, False, True, False, True]
+    rows = [(1.0, "x", ">= 2", "", "1,200 s", "0, 1"), (None, "2", "3 - 4", "", "not run", "0, 1, 2")]
+    assert numeric_columns("abcdef", rows) == [True, False, True, False, True, False]
 
 
 def texts(svg):

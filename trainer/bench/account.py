@@ -53,9 +53,9 @@ def _runs(outcomes: Sequence[Outcome]) -> list[Block]:
     loads = [kept["load_average"][0] / kept["machine"]["cores"] for kept in there]
     text = (
         f"{len(there)} of {len(outcomes)} runs, {number(sum(kept['wall_s'] for kept in there) / 3600)} hours "
-        f"in all, each in a process of one thread, {' to '.join([days[0], *days[-1:]][: len(days)])}, "
+        f"in all, each in a process of its own, {' to '.join(dict.fromkeys((days[0], days[-1])))}, "
         f"onedemo {', '.join(made)}, on {', '.join(processors)}; "
-        f"{number(sum(loads) / len(loads))} processes wanted each core on average."
+        f"load average {number(sum(loads) / len(loads))} a core when they ended."
     )
     return [Text(text), table]
 

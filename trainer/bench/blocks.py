@@ -180,7 +180,7 @@ def shown(cell: Cell) -> str:
     return cell if isinstance(cell, str) else number(cell)
 
 
-_NUMBER = re.compile(r"(?:[<>]=|[<>≤≥≈±])?\s*[-+−]?\d[\d,]*\.?\d*(?:e[-+]?\d+)?(?:\s|%|$)")
+_NUMBER = re.compile(r"(?:[<>]=|[<>≤≥≈±])?\s*[-+−]?\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?(?:\s|%|$)")
 _NOTHING = ("", "–", "not run", "failed")
 
 
