@@ -180,7 +180,8 @@ def _bars(bars: Bars) -> Figure:
             dots, np.full(len(dots), row), "o", color=_INK, markersize=3.6, markeredgecolor="white",
             markeredgewidth=0.7, clip_on=False,
         )  # fmt: skip
-    most = max([0.0, *values, *(dot for dots in bars.each for dot in dots)])
+    everything = [0.0, *values, *(dot for dots in bars.each for dot in dots)]
+    least, most = min(everything), max(everything)
     if bars.reference is not None:
         most = max(most, bars.reference.y)
         axes.axvline(bars.reference.y, color=_QUIET, linewidth=1, linestyle=(0, (4, 3)))
@@ -194,7 +195,7 @@ def _bars(bars: Bars) -> Figure:
             xytext=(8, 0), textcoords="offset points", fontsize=8.5, va="center",
             color=_QUIET if value is None else _INK, annotation_clip=False,
         )  # fmt: skip
-    axes.set_xlim(min(0.0, *values), (most or 1.0) * 1.03)
+    axes.set_xlim(1.03 * least, 1.03 * (most or 1.0))
     axes.set_yticks(rows, labels=list(bars.labels))
     axes.tick_params(axis="y", labelcolor=_INK)
     axes.xaxis.set_major_locator(MaxNLocator(_MOST_TICKS, steps=[1, 2, 2.5, 5, 10]))
