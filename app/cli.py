@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from app.bench import add_commands
 from trainer.errors import UserError
+from trainer.files import check_writable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -126,15 +128,9 @@ def _parser() -> argparse.ArgumentParser:
         help="where to write PREFIX.json, .policy.pt and .hidden.npz",
     )
 
-    bench = _command(commands, "bench", None, "measure the program")
+    bench = _command(commands, "bench", None, "measure the program and the method")
     actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
-    speed = _command(actions, "speed", _bench_speed, "speed, memory and waiting beside peers and limits")
-    speed.add_argument("--quick", action="store_true", help="small and rough: under 2 minutes")
-    speed.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
-    speed.add_argument("--out", type=Path, metavar="DIR", help="write a report with charts there")
-    speed.add_argument(
-        "--part", dest="parts", action="append", metavar="PART", help="only this part; may be repeated"
-    )
+    add_commands(actions, _command)
     return parser
 
 
@@ -319,12 +315,8 @@ def _export(arguments: argparse.Namespace) -> None:
 
 def _check_output(file: Path, data_dir: Path) -> None:
     """Raises UserError, before any work is done, if a result could not be written there."""
-    if file.is_dir():
-        raise UserError(f"{file} is a directory; give the name of a file in it")
-    parent = file.absolute().parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise UserError(f"cannot write {file}: {parent} is not a directory that can be written to")
-    if parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
+    check_writable(file)
+    if file.absolute().parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
         raise UserError(f"{file} is the database; choose another name")
 
 
@@ -347,39 +339,6 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
     save_result(arguments.out, result)
     for key, value in asdict(result.best_score).items():
         print(f"{key:18} {value:g}")
-
-
-def _bench_speed(arguments: argparse.Namespace) -> int:
-    import importlib.util
-    import shlex
-    import time
-
-    from trainer.bench import report, speed
-    from trainer.files import write_atomic
-
-    unknown = set(arguments.parts or ()) - set(speed.PARTS)
-    if unknown:
-        raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(speed.PARTS)}")
-    if arguments.json is not None:
-        _check_output(arguments.json, arguments.json.absolute().parent)
-    if arguments.out is not None and arguments.out.exists() and not arguments.out.is_dir():
-        raise UserError(f"--out {arguments.out} is a file; give the name of a directory")
-    if arguments.out is not None and importlib.util.find_spec("matplotlib") is None:
-        raise UserError("--out needs matplotlib for its charts: pip install -e '.[bench]'")
-    began = time.monotonic()
-    results = speed.measure(
-        quick=arguments.quick,
-        parts=arguments.parts or speed.PARTS,
-        tell=lambda line: print(line, file=sys.stderr, flush=True),
-    )
-    command = shlex.join(["onedemo", *sys.argv[1:]])
-    about = report.as_json(results, command=command, seconds=time.monotonic() - began)
-    print(report.table(results))
-    if arguments.json is not None:
-        write_atomic(arguments.json, (json.dumps(about, indent=1) + "\n").encode())
-    if arguments.out is not None:
-        report.write_report(arguments.out, "onedemo: speed", results, about)
-    return int(any(getattr(result, "failed", False) for result in results))
 
 
 def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:

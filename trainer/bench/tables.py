@@ -1,0 +1,83 @@
+"""The tables of the paper and ours, by name, and what a table is. Light: the command line reads it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, cast
+
+if TYPE_CHECKING:
+    from trainer.bench.document import Document
+    from trainer.bench.study import Job, Outcome
+
+TUNING_FROM = 100
+"""Settings are tuned on seeds from here on, which no table reports; reports take 0, 1, 2 and so on."""
+
+
+class Table(Protocol):
+    """What a module of a table has.
+
+    It runs nothing itself: ``plan`` says what is to be run, ``report`` makes a report of what there is.
+    """
+
+    TITLE: str
+    """Of its report."""
+    SEEDS: int
+    """How many of the reporting seeds it takes when none are given; quick forms take at most two."""
+
+    def plan(self, seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
+        """The jobs, most wanted first. Quick: under 5 minutes on two cores, with two seeds."""
+        ...
+
+    def report(self, outcomes: Sequence[Outcome], *, quick: bool) -> Document:
+        """Of one outcome for each job of the plan, in order. Any of them may have no result.
+
+        It need not say what was typed, on which machine, and which runs are missing: ``account`` does.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A table that can be asked for."""
+
+    module: str
+    """Satisfies ``Table``."""
+    summary: str
+
+
+TABLES = {
+    "predictor": Entry("trainer.bench.predictor_table", "how well ratings are predicted (Table 1)"),
+    "backflip": Entry("trainer.bench.backflip_table", "what is learned, by which method (Table 2)"),
+    "transfer": Entry("trainer.bench.transfer_table", "what a predictor of another move is worth (Table 3)"),
+    "ratings": Entry("trainer.bench.ratings_table", "how much is learned from how many ratings"),
+    "person": Entry("trainer.bench.person_table", "learning from a video of a real person"),
+    "ablation": Entry("trainer.bench.ablation_table", "what each part of the method contributes"),
+}
+"""``onedemo bench NAME``; a new table is one module and one line here."""
+
+
+def find_table(name: str) -> Table:
+    """The module of a table."""
+    return cast(Table, importlib.import_module(TABLES[name].module))
+
+
+def default_seeds(table: Table, *, quick: bool) -> tuple[int, ...]:
+    """The seeds a table takes when none are given."""
+    return tuple(range(min(2, table.SEEDS) if quick else table.SEEDS))
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds as typed: "5" is 0 to 4, "3,7,9" those, "7," seed 7 alone.
+
+    Raises:
+        ValueError: If it is neither a number of at least 1 nor a list of different numbers.
+    """
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    numbers = [int(word) if word.isdecimal() else -1 for word in words]
+    if "," not in text:
+        numbers = list(range(numbers[0])) if numbers else []
+    if not numbers or min(numbers) < 0 or len(set(numbers)) < len(numbers):
+        raise ValueError(f"must be how many seeds, or a list of different ones such as 3,7,9; got {text!r}")
+    return tuple(numbers)
