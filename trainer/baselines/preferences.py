@@ -57,7 +57,8 @@ class PreferencesConfig:
     candidates: int = 10
     """Pairs drawn for each one that is asked about; those with the most disagreement are (section 2.2.4)."""
     segment_seconds: float = 1.5
-    """Length of a segment, seconds: 188 control steps ([C])."""
+    """Length of a segment, seconds ([C]): 188 control steps here. (15 to 60 longer ones there; 25 frames
+    for a person.)"""
     annealing: int = 2_000_000
     """Online comparisons come at a rate proportional to a / (a + t) after t control steps ([C])."""
     steps: int = 3_000_000
