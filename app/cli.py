@@ -120,13 +120,22 @@ def _parser() -> argparse.ArgumentParser:
     trpo.add_argument("--lanes", type=int, default=64, help="episodes side by side (64)")
     trpo.add_argument("--physics", choices=("mujoco", "warp"), default="mujoco")
     trpo.add_argument("--device", default="cpu", metavar="NAME", help="of the policy: cpu (default) or cuda")
-    trpo.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="PREFIX",
-        help="where to write PREFIX.json, .policy.pt and .hidden.npz",
+    preferences = _command(
+        actions, "preferences", _baseline_preferences, "learning from comparisons of two segments"
     )
+    preferences.add_argument(
+        "--comparisons", type=int, default=350, metavar="N", help="in all, 4 of 7 before practice (350)"
+    )
+    preferences.add_argument("--steps", type=int, default=3_000_000, help="control steps (3 million)")
+    preferences.add_argument("--seed", type=int, default=0)
+    for command in (trpo, preferences):
+        command.add_argument(
+            "--out",
+            type=Path,
+            required=True,
+            metavar="PREFIX",
+            help="where to write PREFIX.json, .policy.pt and .hidden.npz",
+        )
 
     bench = _command(commands, "bench", None, "measure the program and the method")
     actions = bench.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
@@ -338,6 +347,24 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
     result = train_handcoded(config)
     save_result(arguments.out, result)
     for key, value in asdict(result.best_score).items():
+        print(f"{key:18} {value:g}")
+
+
+def _baseline_preferences(arguments: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from trainer.baselines.preferences import (
+        PreferencesConfig,
+        save_preferences,
+        split_comparisons,
+        train_preferences,
+    )
+
+    pretrain, online = split_comparisons(arguments.comparisons)
+    config = PreferencesConfig(pretrain=pretrain, online=online, steps=arguments.steps, seed=arguments.seed)
+    result = train_preferences(config)
+    save_preferences(arguments.out, result)
+    for key, value in asdict(result.curve[-1]).items():
         print(f"{key:18} {value:g}")
 
 

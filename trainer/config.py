@@ -95,6 +95,7 @@ METHODS: dict[str, dict[str, Any]] = {
         "practice.bank_share": 0.0,
         "practice.give_up": 0.0,
         "policy.kind": "clock",
+        "trpo.final_kl": 0.05,
     },
 }
 """What each method sets where nothing else is said: the defaults are onedemo's."""

@@ -178,7 +178,8 @@ class Learner:
             rollouts = self._collector.collect(policy, steps)
             rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
             predicted = float(rewards.mean())
-        stats = self._trpo.update(rollouts, rewards)
+        progress = min(1.0, self.env_steps / sizes.total_steps)
+        stats = self._trpo.update(rollouts, rewards, progress=progress)
         self.iteration += 1
         self.env_steps += rollouts.clock.size
         return rollouts, {"predicted": predicted, **asdict(stats)}

@@ -34,6 +34,9 @@ class TrpoConfig:
     max_kl: float = 0.05
     """Trust-region radius, mean KL(old || new) over the batch, nats. Schulman et al. 2015 use 0.01;
     batches of 16 thousand steps and more bear longer steps."""
+    final_kl: float = 0.01
+    """The radius at the end of a training; it shrinks in proportion to what has been practised, so that the
+    last steps refine and do not throw over."""
     gamma: float = 0.99
     """Discount per control step, in [0, 1)."""
     lam: float = 0.97
@@ -60,6 +63,8 @@ class TrpoConfig:
     def __post_init__(self) -> None:
         if self.max_kl <= 0:
             raise ValueError(f"trpo.max_kl must be > 0 nats, got {self.max_kl}")
+        if not 0 < self.final_kl:
+            raise ValueError(f"trpo.final_kl must be > 0 nats, got {self.final_kl}")
         if not 0 <= self.gamma < 1:
             raise ValueError(f"trpo.gamma must be in [0, 1), got {self.gamma}")
         if not 0 <= self.lam <= 1:
@@ -121,12 +126,13 @@ class Trpo:
         self._beside = ThreadPoolExecutor(1, "value", _one_thread) if threads > 1 else None
         self._generator = torch.Generator().manual_seed(seed)
 
-    def update(self, rollouts: Rollouts, rewards_NT: np.ndarray) -> TrpoStats:
+    def update(self, rollouts: Rollouts, rewards_NT: np.ndarray, *, progress: float = 0.0) -> TrpoStats:
         """One TRPO step, then the value regression, then the policy's input normaliser.
 
         Args:
             rollouts: What the current policy did.
             rewards_NT: Reward of each step, (N, T), any units.
+            progress: How much of the training is over, 0..1: moves the radius from ``max_kl`` to ``final_kl``.
 
         Returns:
             What the step did.
@@ -136,6 +142,7 @@ class Trpo:
         """
         if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
+        max_kl = self.config.max_kl + progress * (self.config.final_kl - self.config.max_kl)
         device = self.policy.device
         inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1).to(device)
         actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1).to(device)
@@ -161,7 +168,9 @@ class Trpo:
         regression = partial(self._fit_value, inputs_Bf, returns_B, orders)
         beside = self._beside.submit(regression) if self._beside is not None else None
         try:
-            accepted, backtracks, kl, improvement = self._improve(inputs_Bf, actions_Ba, advantages_B, sample)
+            accepted, backtracks, kl, improvement = self._improve(
+                inputs_Bf, actions_Ba, advantages_B, sample, max_kl
+            )
         finally:  # whatever happens, nothing goes on behind the caller's back
             value_loss = regression() if beside is None else beside.result()
         self.policy.observe(rollouts.obs, rollouts.clock)
@@ -214,6 +223,7 @@ class Trpo:
         actions_Ba: torch.Tensor,
         advantages_B: torch.Tensor,
         sample: torch.Tensor,
+        max_kl: float,
     ) -> tuple[bool, int, float, float]:
         config, policy = self.config, self.policy
         mean_Ba = policy(inputs_Bf)
@@ -233,7 +243,7 @@ class Trpo:
             curvature = direction_P @ (gradient_P - left_P)  # d F d, as F d is known by now
             if not torch.isfinite(curvature) or curvature <= 0:  # no gradient: nothing to improve
                 return False, 0, 0.0, 0.0
-            step_P = direction_P * torch.sqrt(2 * config.max_kl / curvature)
+            step_P = direction_P * torch.sqrt(2 * max_kl / curvature)
             old_P = parameters_to_vector(self._parameters).clone()
             for tries in range(config.backtracks):
                 step = config.backtrack_factor**tries * step_P
@@ -241,7 +251,7 @@ class Trpo:
                 mean_Ba = policy(inputs_Bf)
                 gain = float(objective(policy.log_prob_of(mean_Ba, actions_Ba)) - before)
                 kl = float(mean_kl(old_mean_Ba, old_log_std, mean_Ba, policy.log_std))
-                if gain > 0 and kl <= config.max_kl:
+                if gain > 0 and kl <= max_kl:
                     return True, tries, kl, gain
             vector_to_parameters(old_P, self._parameters)
         return False, config.backtracks, 0.0, 0.0

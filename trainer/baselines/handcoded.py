@@ -3,8 +3,6 @@
 ``python -m trainer.baselines.handcoded --task backflip --steps 3000000 --seed 2 --out PREFIX``
 writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
 ``PREFIX.json`` (settings and the learning curve).
-
-Shapes: N lanes or episodes, T control steps.
 """
 
 from __future__ import annotations
@@ -19,18 +17,13 @@ import torch
 from tqdm import tqdm
 
 from trainer import envs
+from trainer.baselines.scores import Score, judge, save_training
 from trainer.errors import UserError
-from trainer.hidden import SUFFIX, HiddenStates, save_hidden
-from trainer.motion import (
-    TASK_REWARDS,
-    clean_turns,
-    net_turns,
-    task_reward,
-    until_fall,
-)
+from trainer.hidden import HiddenStates
+from trainer.motion import TASK_REWARDS
 from trainer.policy import Policy, PolicyConfig, check_device
 from trainer.priority import cores
-from trainer.rollouts import Collector, Episodes, evaluate
+from trainer.rollouts import Collector, evaluate
 from trainer.trpo import Trpo, TrpoConfig
 
 
@@ -70,26 +63,6 @@ class HandcodedConfig:
         for name in ("steps", "lanes", "batch", "horizon", "evaluate_every", "threads"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Score:
-    """An evaluation: 16 deterministic episodes."""
-
-    steps: int
-    """Control steps learned from so far."""
-    seconds: float
-    """Wall time so far."""
-    reward_mean: float
-    """Hand-coded reward of an episode."""
-    reward_max: float
-    """Of the best episode."""
-    net_turns_mean: float
-    """Backward turns of an episode."""
-    clean_turns_mean: float
-    """Backward turns of an episode on the foot alone."""
-    upright_seconds: float
-    """Mean time until the stock Hopper-v5 would have fallen."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -156,7 +129,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
             if iteration % config.evaluate_every == 0 or iteration == iterations:
                 episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)
                 steps, seconds = iteration * per_iteration, time.monotonic() - started
-                score, episode = _judge(config, episodes, steps, seconds)
+                score, episode = judge(config.task, episodes, steps=steps, seconds=seconds)
                 curve.append(score)
                 if best is None or score.reward_mean > best[0].reward_mean:
                     best = score, policy.to_dict(), episode
@@ -183,43 +156,14 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
 
 def save_result(prefix: Path, result: HandcodedResult) -> None:
     """Writes ``<prefix>.hidden.npz``, ``<prefix>.policy.pt`` and ``<prefix>.json``."""
-    save_hidden(prefix.with_name(prefix.name + SUFFIX), result.episode)
-    torch.save(result.best.to_dict(), prefix.with_name(prefix.name + ".policy.pt"))
-    report = {
-        "config": asdict(result.config),
-        "best": asdict(result.best_score),
-        "curve": [asdict(score) for score in result.curve],
-    }
-    prefix.with_name(prefix.name + ".json").write_text(json.dumps(report, indent=2) + "\n")
-
-
-def _judge(
-    config: HandcodedConfig, episodes: Episodes, steps: int, seconds: float
-) -> tuple[Score, HiddenStates]:
-    """The score, and the episode of the highest reward."""
-    states = episodes.obs, episodes.actions, episodes.qpos, episodes.qvel
-    rewards_NT = task_reward(config.task, *states)
-    upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:])
-    if config.task == "hop":  # the stock episode ends at the fall
-        rewards_NT = rewards_NT * upright_NT
-    totals_N = rewards_NT.sum(1)
-    score = Score(
-        steps=steps,
-        seconds=round(seconds, 1),
-        reward_mean=float(totals_N.mean()),
-        reward_max=float(totals_N.max()),
-        net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
-        clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
-        upright_seconds=float(upright_NT.sum(1).mean() * envs.spec("hopper").dt),
+    save_training(
+        prefix,
+        config=result.config,
+        curve=result.curve,
+        policy=result.best,
+        episode=result.episode,
+        best=result.best_score,
     )
-    lane = int(totals_N.argmax())
-    episode = HiddenStates(
-        obs=episodes.obs[lane],
-        actions=episodes.actions[lane],
-        qpos=episodes.qpos[lane],
-        qvel=episodes.qvel[lane],
-    )
-    return score, episode
 
 
 def main(argv: list[str] | None = None) -> None:

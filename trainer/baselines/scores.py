@@ -1,0 +1,103 @@
+"""What every baseline reports: scores of 16 deterministic episodes, and the files of a training.
+
+Shapes: N episodes, T control steps.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trainer import envs
+from trainer.hidden import SUFFIX, HiddenStates, save_hidden
+from trainer.motion import clean_turns, net_turns, task_reward, until_fall
+from trainer.policy import Policy
+from trainer.rollouts import Episodes
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Score:
+    """An evaluation: 16 deterministic episodes."""
+
+    steps: int
+    """Control steps learned from so far."""
+    seconds: float
+    """Wall time so far."""
+    reward_mean: float
+    """Hand-coded reward of an episode."""
+    reward_max: float
+    """Of the best episode."""
+    net_turns_mean: float
+    """Backward turns of an episode."""
+    clean_turns_mean: float
+    """Backward turns of an episode on the foot alone."""
+    upright_seconds: float
+    """Mean time until the stock Hopper-v5 would have fallen."""
+
+
+def judge(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple[Score, HiddenStates]:
+    """The score of an evaluation, and its episode of the highest reward.
+
+    Args:
+        task: A key of ``motion.TASK_REWARDS``.
+        episodes: The evaluation.
+        steps: Control steps learned from so far.
+        seconds: Wall time so far.
+    """
+    states = episodes.obs, episodes.actions, episodes.qpos, episodes.qvel
+    rewards_NT = task_reward(task, *states)
+    upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:])
+    if task == "hop":  # the stock episode ends at the fall
+        rewards_NT = rewards_NT * upright_NT
+    totals_N = rewards_NT.sum(1)
+    score = Score(
+        steps=steps,
+        seconds=round(seconds, 1),
+        reward_mean=float(totals_N.mean()),
+        reward_max=float(totals_N.max()),
+        net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
+        clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
+        upright_seconds=float(upright_NT.sum(1).mean() * envs.spec("hopper").dt),
+    )
+    lane = int(totals_N.argmax())
+    episode = HiddenStates(
+        obs=episodes.obs[lane],
+        actions=episodes.actions[lane],
+        qpos=episodes.qpos[lane],
+        qvel=episodes.qvel[lane],
+    )
+    return score, episode
+
+
+def save_training(
+    prefix: Path,
+    *,
+    config: Any,
+    curve: Sequence[Score],
+    policy: Policy,
+    episode: HiddenStates,
+    **scores: Score,
+) -> None:
+    """Writes ``<prefix>.hidden.npz``, ``<prefix>.policy.pt`` and ``<prefix>.json``.
+
+    Args:
+        prefix: Where.
+        config: Settings, a dataclass.
+        curve: Evaluations.
+        policy: What to keep.
+        episode: One of its episodes.
+        **scores: Evaluations to name in the JSON file, beside the curve.
+    """
+    save_hidden(prefix.with_name(prefix.name + SUFFIX), episode)
+    torch.save(policy.to_dict(), prefix.with_name(prefix.name + ".policy.pt"))
+    report = {
+        "config": asdict(config),
+        **{name: asdict(score) for name, score in scores.items()},
+        "curve": [asdict(score) for score in curve],
+    }
+    prefix.with_name(prefix.name + ".json").write_text(json.dumps(report, indent=2) + "\n")
