@@ -35,7 +35,7 @@ def summarise(
     """
     episodes = evaluate(
         learner.policy(), learner.config.env, episodes=EPISODES, seed=_SEED,
-        rules=learner.rules(EPISODES, snapshot),
+        rules=learner.rules(EPISODES, snapshot) if snapshot is not None else None,
     )  # fmt: skip
     return {
         "predicted_similarity": _spread(_predicted(learner, snapshot, episodes)),
