@@ -109,14 +109,14 @@ def test_the_track_of_a_steady_move_is_right_from_the_first_frame_to_the_last():
     assert fast[5, 0] == pytest.approx(2 * slow[5, 0])
 
 
-def test_the_track_of_a_real_fall_is_near_its_true_motion():
+def test_the_track_of_a_fall_is_near_its_true_motion():
     hidden = falling_states()
     obs = hidden.obs[FRAME_STEPS]
     track = PerfectEye().track(body.pose(obs), 30.0)
     np.testing.assert_allclose(track.pose, body.pose(obs), atol=0.2)
-    error = np.abs(track.motion - body.motion(obs))
-    assert error.mean() < 0.08 and np.abs(body.motion(obs)).mean() > 0.15
-    assert error[[0, 1, -2, -1]].mean() < 0.15
+    true = body.motion(obs)  # a tenth of a second is seen at once, in which it jerks and hits the ground
+    assert np.corrcoef(track.motion.ravel(), true.ravel())[0, 1] > 0.85
+    assert np.abs(track.motion - true)[:2].mean() < 0.1 < np.abs(true).mean()
 
 
 def test_sines_that_fall_short_of_one_are_directions_all_the_same():
@@ -193,6 +193,10 @@ def test_pictures_come_with_the_poses_they_show():
     assert 0 < standing.sum() < 24  # some as they begin upright, most not
 
 
+class OtherEncoder(Thumbnail):
+    name = "other"
+
+
 @pytest.mark.seam
 def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, monkeypatch, caplog):
     first = learn("hopper", Thumbnail(), tmp_path)
@@ -206,6 +210,8 @@ def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, mo
         again = learn("hopper", Thumbnail(), tmp_path)
         with pytest.raises(AssertionError, match="drawn again"):
             learn("hopper", Thumbnail(), tmp_path / "elsewhere")
+        with pytest.raises(AssertionError, match="drawn again"):
+            learn("hopper", OtherEncoder(), tmp_path)
     features = np.random.default_rng(0).uniform(0, 255, (5, 64)).astype(np.float32)
     np.testing.assert_array_equal(again.poses(features), first.poses(features))
     np.testing.assert_array_equal(again.held_out, first.held_out)

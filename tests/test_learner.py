@@ -88,7 +88,7 @@ def test_any_number_of_threads_gives_the_same_policy(features, method):
     for threads in (1, 2):
         learner = make_learner(features, CONFIGS[method](rollouts__threads=threads))
         snapshot, _ = learner.fit(rated(learner), 1)
-        for _ in range(3):
+        for _ in range(2):
             learner.iterate(snapshot)
         ends.append(learner.policy().weights)
     for one, two in zip(*ends, strict=True):
@@ -138,7 +138,7 @@ def test_practice_raises_the_predicted_rating(features):
 
 @METHODS
 def test_a_resumed_learner_does_what_the_uninterrupted_one_does(features, tmp_path, method):
-    config = CONFIGS[method]()
+    config = CONFIGS[method]() if method == "paper" else onedemo(practice__give_up=0.5)
     ratings = rated(make_learner(features, config))
 
     def curves(learner, count):
@@ -146,14 +146,14 @@ def test_a_resumed_learner_does_what_the_uninterrupted_one_does(features, tmp_pa
         return [learner.iterate(snapshot)[1] for _ in range(count)]
 
     whole = make_learner(features, config)
-    expected = curves(whole, 5)
+    expected = curves(whole, 4)
     first = make_learner(features, config)
     curves(first, 2)
     torch.save(first.state_dict(), tmp_path / "state.pt")
     second = Learner(config, FRAMES, 30.0)
     second.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
     second.look_at(features, falling_track() if method == "onedemo" else None)  # in the order of a run
-    assert curves(second, 3) == expected[2:]
+    assert curves(second, 2) == expected[2:]
     assert (second.iteration, second.env_steps) == (whole.iteration, whole.env_steps)
 
 
@@ -303,7 +303,7 @@ def test_a_new_snapshot_fills_a_new_bank(features, by_distance):
 
 def test_onedemo_end_to_end_learns_to_be_like_the_demo(features, by_distance):
     """From sixty ratings in two rounds to a policy that gets more of the demo done from standing."""
-    config = onedemo(rollouts__lanes=16, rollouts__steps=125, rollouts__total_steps=30_000)
+    config = onedemo(rollouts__lanes=16, rollouts__steps=125, rollouts__total_steps=20_000)
     learner = make_learner(features, config)
     ratings = asked(learner, by_distance, 30)
     snapshot, _ = learner.fit(ratings, 1)
@@ -317,7 +317,7 @@ def test_onedemo_end_to_end_learns_to_be_like_the_demo(features, by_distance):
         return rules.take_rewards().sum(axis=1).mean()
 
     before, curve = whole_episodes(), []
-    while learner.env_steps < 30_000:
+    while learner.env_steps < 20_000:
         curve.append(learner.iterate(snapshot)[1])
     assert whole_episodes() > 1.3 * before
     assert learner.iterate(snapshot)[1]["kl"] <= config.trpo.final_kl < curve[0]["kl"]  # the region shrank

@@ -289,7 +289,7 @@ def watched_run(store, demo, config):
 
 
 def learns_the_same_from_noise(demo, tmp_path, config):
-    """Runs whose demo has its true hidden states, noise in their place, and none; the first one's end."""
+    """Runs whose demo has its true hidden states, and noise in their place; the first one's end."""
     file = hidden_path(demo.path)
     truth = load_hidden(file)
     rng = np.random.default_rng(0)
@@ -297,10 +297,8 @@ def learns_the_same_from_noise(demo, tmp_path, config):
     noise = HiddenStates(**{f: rng.normal(size=getattr(truth, f).shape) for f in fields})
     trainers, asked, arrays = [], [], []
     try:
-        for name, hidden in (("truth", truth), ("noise", noise), ("none", None)):
-            file.unlink()
-            if hidden is not None:
-                save_hidden(file, hidden)
+        for name, hidden in (("truth", truth), ("noise", noise)):
+            save_hidden(file, hidden)
             store = Store(tmp_path / name)
             trainers.append(watched_run(store, demo, config))
             learner, snapshot = trainers[-1].final_policy()
@@ -309,10 +307,9 @@ def learns_the_same_from_noise(demo, tmp_path, config):
             store.close()
     finally:
         save_hidden(file, truth)
-    assert asked[0] == asked[1] == asked[2] and len(asked[0]) >= 18  # the same clips, chosen alike
-    for one, noisy, none in zip(*arrays, strict=True):
-        np.testing.assert_array_equal(one, noisy)
-        np.testing.assert_array_equal(one, none)
+    assert asked[0] == asked[1] and len(asked[0]) >= 18  # the same clips, chosen alike
+    for one, two in zip(*arrays, strict=True):
+        np.testing.assert_array_equal(one, two)
     return trainers[0].final_policy()
 
 
@@ -337,7 +334,7 @@ def few_pictures(monkeypatch):
     monkeypatch.setattr("trainer.practice._BANK_TRIES", 500)
 
 
-ONEDEMO = {"method": "onedemo", "ratings__rounds": 3, "practice__give_up": 0.3}
+ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
 
 
 @pytest.mark.seam
@@ -345,7 +342,7 @@ def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path, f
     """Appearance, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
     demo = drawn_demo(tmp_path / "demo")
     learner, snapshot = learns_the_same_from_noise(
-        demo, tmp_path, small_config(**ONEDEMO, rollouts__total_steps=1200)
+        demo, tmp_path, small_config(**ONEDEMO, rollouts__total_steps=800)
     )
     assert isinstance(snapshot, MetricSnapshot)  # it did see poses in the demo
     assert learner.config.practice.elastic and learner.config.practice.bank_share
@@ -359,21 +356,22 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
     first: Trainer
 
     def stop(learner, snapshot):
-        if learner.iteration == 3:
+        if learner.iteration == 2:
             first.stop()
 
     curves = []
     for name, threads in (("whole", 1), ("stopped", 1), ("two", 2)):
-        config = small_config(**ONEDEMO, ratings__online=0, rollouts__threads=threads)
+        settings = {"ratings__online": 0, "rollouts__total_steps": 1600, "rollouts__threads": threads}
+        config = small_config(**ONEDEMO, **settings)
         store = Store(tmp_path / name)
         if name == "stopped":
             first = make_trainer(store, demo, rater, config=config, encoder=Mixed(), watch=stop)
             first.work()
-            assert len(store.iterations("r")) == 3
+            assert len(store.iterations("r")) == 2
         make_trainer(store, demo, rater, config=config, encoder=Mixed()).work()
         rows = store.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()
-    assert len(curves[0]) == 6
+    assert len(curves[0]) == 4
     assert curves[0] == curves[1]
     assert curves[0] == curves[2]

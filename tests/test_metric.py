@@ -53,8 +53,8 @@ def true_distance(view, frames, obs):
     return np.sqrt((WEIGHTS * np.square(difference)).sum(axis=(-1, -2)))
 
 
-def world(rollouts, view, count, seed):
-    """Clips at random beside random frames; a rating by fifths of the true distance. And that distance."""
+def world(rollouts, view, count, seed, bounds=(2.1, 2.5, 2.85, 3.2)):
+    """Clips at random beside random frames; a rating by bounds of the true distance. And that distance."""
     rng = np.random.default_rng(seed)
     clips, frames = [], []
     for _ in range(count):
@@ -63,7 +63,7 @@ def world(rollouts, view, count, seed):
         frames.append(int(rng.integers(FRAMES - 10)) + np.arange(STEPS) // 4)
     frames = np.array(frames)
     distance = true_distance(view, frames, np.stack([c.obs for c in clips])).mean(axis=1)
-    values = 5 - np.digitize(distance, [2.1, 2.5, 2.85, 3.2])
+    values = 5 - np.digitize(distance, bounds)
     ratings = [
         RatedSegment(event=i, demo_step=0, segment=clip, value=int(value))
         for i, (clip, value) in enumerate(zip(clips, values, strict=True))
@@ -147,6 +147,18 @@ def test_absent_classes_do_no_harm(rollouts, view, members):
     assert rank_correlation(value, -distance) > 0.8
     whole = snapshot.tensors()["thresholds"].numpy()
     assert np.isfinite(whole).all() and (np.diff(whole, axis=1) > 0).all()
+
+
+def test_rare_classes_count_as_much_as_common_ones(rollouts, view):
+    """One clip, nine times rated 1 and once 5. Each 1 counts 0.3, the least, and the 5 counts 2.
+
+    So a 5 has a chance of 2 / (2 + 9 * 0.3) = 0.43; counted alike, of 0.1.
+    """
+    ratings, frames, _ = world(rollouts, view, 1, seed=0)
+    ten = [replace(ratings[0], event=i, value=5 if i == 0 else 1) for i in range(10)]
+    alone = replace(CONFIG, members=1)
+    snapshot, _ = fit(ten, np.repeat(frames, 10, axis=0), view, alone, number=1, seed=0)
+    assert predicted(snapshot, ten[:1], frames)[0] == pytest.approx(1 + 4 * 0.43, abs=0.4)
 
 
 @pytest.mark.parametrize("value", [1, 3, 5])

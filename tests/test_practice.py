@@ -176,11 +176,10 @@ def test_nothing_is_given_up_in_the_first_steps_of_an_episode():
 
 
 def test_a_new_episode_is_a_new_chance():
-    rules = make_rules(PracticeConfig(elastic=False, give_up=0.5), lanes=2, width=1.0)
-    given_up_after(rules, [10**4, 10**4], limit=12)
-    rules.start(np.array([0]), np.random.default_rng(0))
-    now = step([0, 0], [10**4, 10**4])
-    assert rules.stop(now, rules.advance(now)).tolist() == [False, True]
+    rules = make_rules(PracticeConfig(elastic=False), lanes=2, width=1.0)
+    assert given_up_after(rules, [10**4, 10**4], limit=34).tolist() == [34, 34]
+    rules.start(np.array([0]), np.random.default_rng(0))  # the other one's goes on, unlike in a run
+    assert given_up_after(rules, [10**4, 10**4]).tolist() == [34, 1]
 
 
 def test_it_can_be_switched_off():
