@@ -27,7 +27,7 @@ from trainer.bench.study import Job
 from trainer.config import RunConfig, load_config
 from trainer.demos import find_demo
 from trainer.encoders import demo_features, make_encoder
-from trainer.evaluation import perform, per_episode, predicted_similarity, spread, state_errors
+from trainer.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
 from trainer.files import hold
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden
@@ -180,8 +180,8 @@ class Watch:
             self._last = episodes, values
             self._curve["env_steps"].append(learner.env_steps)
             for name in CURVES:
-                figure = spread(name, values[name])
-                self._curve[name].append(figure and figure["mean"])
+                each = values[name]
+                self._curve[name].append(None if each is None else round(float(np.mean(each)), 4))
         self.ended = time.monotonic()
         self.seconds += self.ended - began
 
