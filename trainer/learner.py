@@ -19,6 +19,7 @@ from trainer.appearance import Track
 from trainer.choice import Question, choose
 from trainer.config import RunConfig
 from trainer.errors import UserError
+from trainer.imagined import track_basis
 from trainer.policy import Policy, PolicySnapshot, check_device
 from trainer.practice import PracticeRules, fill_bank
 from trainer.predictor import FitStats, Snapshot, View, fit, visual_inputs
@@ -64,6 +65,7 @@ class Learner:
         self.iteration = 0
         self.env_steps = 0
         self._view: View | None = None
+        self._fps = fps
         self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
         self._policy = self._make_policy().to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
@@ -82,7 +84,12 @@ class Learner:
             features: Features of its frames, (F, D).
             track: What the frames show of the robot; None if that is not known.
         """
-        self._view = View(visual=visual_inputs(features, self.config.predictor.visual_dims), track=track)
+        self._view = View(
+            visual=visual_inputs(features, self.config.predictor.visual_dims),
+            track=track,
+            basis=track_basis(features, self._fps),
+            fps=self._fps,
+        )
         if self.config.policy.kind == "table":
             if track is not None:
                 shown = np.concatenate([track.pose, track.motion], axis=-1)

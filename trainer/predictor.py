@@ -12,7 +12,7 @@ import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,10 @@ class View:
     """Principal components of the frame features, (F, V), float32."""
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
+    basis: np.ndarray
+    """Functions of the frames that an unknown track is made of (``trainer/imagined.py``), (F, R), float32."""
+    fps: float
+    """Frames per second."""
 
 
 class Snapshot(ABC):
@@ -184,7 +188,7 @@ def fit(
         ratings: n rated segments, all of W steps.
         frames: Index of the demo frame at each step of each segment, (n, W).
         view: The demo.
-        config: Which kind, and how; a "metric" of a demo without a track is a "network".
+        config: Which kind, and how.
         number: The snapshot's number.
         seed: Of everything random.
         device: Where torch computes; what is drawn at random is the same everywhere.
@@ -197,8 +201,6 @@ def fit(
     """
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
-    if config.kind == "metric" and view.track is None:
-        config = replace(config, kind="network")  # what is saved says how it is to be read
     module = importlib.import_module(KINDS[config.kind])
     return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device)
 
