@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from worlds import Thumbnail, falling_demo, small_config
+from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
 import trainer
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from trainer.loop import Simulated, Trainer
+from trainer.metric import MetricSnapshot
 from trainer.runs import add_run, find_run
 from trainer.store import Store
 
@@ -30,14 +31,14 @@ def store(tmp_path):
     store.close()
 
 
-def make_trainer(store, demo, simulated=None, config=None, name="r"):
+def make_trainer(store, demo, simulated=None, config=None, name="r", encoder=None, watch=None):
     data_dir = store.path.parent
     config = config or small_config()
     found = find_run(store, data_dir, demo, name=name, wanted=config)
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     return Trainer(
-        store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=Thumbnail(),
-        simulated=simulated,
+        store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder or Thumbnail(),
+        simulated=simulated, watch=watch,
     )  # fmt: skip
 
 
@@ -207,6 +208,12 @@ LEARNING = (
     "loop",
     "learner",
     "predictor",
+    "network",
+    "metric",
+    "appearance",
+    "body",
+    "starts",
+    "practice",
     "policy",
     "trpo",
     "rollouts",
@@ -214,6 +221,7 @@ LEARNING = (
     "encoders",
     "demos",
     "clipmaker",
+    "training_set",
 )
 
 
@@ -254,32 +262,118 @@ def _note_opens(event, arguments):
 sys.addaudithook(_note_opens)
 
 
-def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_path):
-    """With the hidden states replaced by noise, the same ratings give the same policy."""
+class Mixed(Thumbnail):
+    """As in a network each feature sees all of the picture: none is constant in all pictures of a robot."""
+
+    name = "mixed"
+
+    def encode(self, frames):
+        mixture = np.random.default_rng(0).normal(size=(self.dims, self.dims)).astype(np.float32)
+        return super().encode(frames) @ mixture
+
+
+def watched_run(store, demo, config):
+    """A whole run rated by a rule, during which no hidden file may be opened; its end."""
     global _watching
-    file = hidden_path(demo.path)
-    truth = load_hidden(file)
-    weights = []
+    _opened.clear()
+    _watching = True
     try:
-        for name in ("truth", "noise"):
-            if name == "noise":
-                rng = np.random.default_rng(0)
-                fields = ("obs", "actions", "qpos", "qvel")
-                save_hidden(
-                    file, HiddenStates(**{f: rng.normal(size=getattr(truth, f).shape) for f in fields})
-                )
-            store = Store(tmp_path / name)
-            _opened.clear()
-            _watching = True
-            trainer_ = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
-            trainer_.work()
-            _watching = False
-            assert any(path.endswith("config.toml") or "checkpoint" in path for path in _opened)
-            assert not [path for path in _opened if path.endswith(".hidden.npz")]
-            weights.append(trainer_.final_policy()[0].policy().weights)
-            store.close()
+        rater = Simulated(name="rule", rate=by_rule)
+        trainer_ = make_trainer(store, demo, rater, config=config, encoder=Mixed())
+        trainer_.work()
     finally:
         _watching = False
+    assert any(path.endswith("config.toml") or "checkpoint" in path for path in _opened)
+    assert not [path for path in _opened if path.endswith(".hidden.npz")]
+    return trainer_
+
+
+def learns_the_same_from_noise(demo, tmp_path, config):
+    """Runs whose demo has its true hidden states, noise in their place, and none; the first one's end."""
+    file = hidden_path(demo.path)
+    truth = load_hidden(file)
+    rng = np.random.default_rng(0)
+    fields = ("obs", "actions", "qpos", "qvel")
+    noise = HiddenStates(**{f: rng.normal(size=getattr(truth, f).shape) for f in fields})
+    trainers, asked, arrays = [], [], []
+    try:
+        for name, hidden in (("truth", truth), ("noise", noise), ("none", None)):
+            file.unlink()
+            if hidden is not None:
+                save_hidden(file, hidden)
+            store = Store(tmp_path / name)
+            trainers.append(watched_run(store, demo, config))
+            learner, snapshot = trainers[-1].final_policy()
+            arrays.append([*learner.policy().weights, learner.policy().mean, *flat(snapshot.tensors())])
+            asked.append([store.clip(i) for i in range(1, store.count_clips("r") + 1)])
+            store.close()
+    finally:
         save_hidden(file, truth)
-    for one, two in zip(*weights, strict=True):
-        np.testing.assert_array_equal(one, two)
+    assert asked[0] == asked[1] == asked[2] and len(asked[0]) >= 18  # the same clips, chosen alike
+    for one, noisy, none in zip(*arrays, strict=True):
+        np.testing.assert_array_equal(one, noisy)
+        np.testing.assert_array_equal(one, none)
+    return trainers[0].final_policy()
+
+
+def flat(tree):
+    """All tensors of a snapshot."""
+    if isinstance(tree, torch.Tensor):
+        return [tree.numpy()]
+    return [x for branch in (tree.values() if isinstance(tree, dict) else tree) for x in flat(branch)]
+
+
+def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_path):
+    """With the hidden states replaced by noise, the same ratings give the same policy."""
+    learns_the_same_from_noise(demo, tmp_path, small_config())
+
+
+@pytest.fixture
+def few_pictures(monkeypatch):
+    """Of the robot, and few random states: enough to see poses by, if badly."""
+    monkeypatch.setattr("trainer.appearance.PICTURES", 80)
+    monkeypatch.setattr("trainer.appearance._EPOCHS", 4)
+    monkeypatch.setattr("trainer.learner._WILD_LANES", 8)
+    monkeypatch.setattr("trainer.practice._BANK_TRIES", 500)
+
+
+ONEDEMO = {"method": "onedemo", "ratings__rounds": 3, "practice__give_up": 0.3}
+
+
+@pytest.mark.seam
+def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path, few_pictures):
+    """Appearance, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
+    demo = drawn_demo(tmp_path / "demo")
+    learner, snapshot = learns_the_same_from_noise(
+        demo, tmp_path, small_config(**ONEDEMO, rollouts__total_steps=1200)
+    )
+    assert isinstance(snapshot, MetricSnapshot)  # it did see poses in the demo
+    assert learner.config.practice.elastic and learner.config.practice.bank_share
+
+
+@pytest.mark.seam
+def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_path, few_pictures):
+    """What the robot looks like and the bank are made again, the running similarity is kept."""
+    demo = drawn_demo(tmp_path / "demo")
+    rater = Simulated(name="rule", rate=by_rule)
+    first: Trainer
+
+    def stop(learner, snapshot):
+        if learner.iteration == 3:
+            first.stop()
+
+    curves = []
+    for name, threads in (("whole", 1), ("stopped", 1), ("two", 2)):
+        config = small_config(**ONEDEMO, ratings__online=0, rollouts__threads=threads)
+        store = Store(tmp_path / name)
+        if name == "stopped":
+            first = make_trainer(store, demo, rater, config=config, encoder=Mixed(), watch=stop)
+            first.work()
+            assert len(store.iterations("r")) == 3
+        make_trainer(store, demo, rater, config=config, encoder=Mixed()).work()
+        rows = store.iterations("r")
+        curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
+        store.close()
+    assert len(curves[0]) == 6
+    assert curves[0] == curves[1]
+    assert curves[0] == curves[2]
