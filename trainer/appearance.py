@@ -37,6 +37,8 @@ _MEMBERS = 3
 _EPOCHS = 25
 _BATCH = 64
 _RATE = 2e-3
+_DROPPED = 0.2
+_NOISE = 0.1
 _VERSION = 4  # raise it when what is drawn or how it is learned changes
 _SMOOTH = np.array([1.0, 2.0, 1.0]) / 4
 _AROUND = 2
@@ -152,10 +154,22 @@ def pictures(env_name: str, encoder: Encoder, count: int) -> tuple[np.ndarray, n
 def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
 
+    One thread computes: several would add up in another order, and runs with another number of
+    ``rollouts.threads`` would see other poses. They would also be slower, as the networks are small.
+
     Args:
         features: (n, D).
         poses: (n, P).
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _regress(features, poses)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
     inputs, targets = torch.from_numpy((features - mean) / std), torch.from_numpy(poses)
@@ -186,10 +200,6 @@ def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
     return appearance
 
 
-_DROPPED = 0.2
-_NOISE = 0.1
-
-
 def _network(features: int) -> nn.Sequential:
     layer = nn.utils.skip_init
     return nn.Sequential(
@@ -207,8 +217,8 @@ def _draw_weights(net: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _smooth(x: np.ndarray) -> np.ndarray:
-    """A moving average along time, (F, ...); the ends repeat."""
-    padded = np.concatenate([x[:1], x, x[-1:]])
+    """A moving average along time, (F, ...), F > 1. Past the ends it goes on as it came."""
+    padded = np.concatenate([2 * x[:1] - x[1:2], x, 2 * x[-1:] - x[-2:-1]])
     return np.sum([weight * padded[i : i + len(x)] for i, weight in enumerate(_SMOOTH)], axis=0)
 
 

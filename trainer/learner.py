@@ -103,7 +103,7 @@ class Learner:
         """
         config = self.config
         if config.ratings.starts == "random":
-            return self._wild_rollouts()
+            return self._wild_rollouts()  # the bank picks from the same
         collector = self._make_collector(_RANDOM_LANES, seed=config.seed + 1, stagger=False)
         return collector.collect(self._make_policy().snapshot(), self.demo_steps)
 
@@ -227,18 +227,19 @@ class Learner:
             return
         bank = None
         if self.config.practice.bank_share:
-            self._wild = self._wild or self._wild_rollouts()
             rng = np.random.default_rng([self.config.seed, snapshot.number])
-            bank = fill_bank(snapshot, self._wild, self.frames_of, self.demo_steps, rng)
+            bank = fill_bank(snapshot, self._wild_rollouts(), self.frames_of, self.demo_steps, rng)
         rules.use(snapshot, bank)
         self._banked = snapshot.number
 
     def _wild_rollouts(self) -> Transitions:
-        config, every = self.config, round(_WILD_SECONDS / self.dt)
-        return wild_rollouts(
-            config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
-            nthread=config.rollouts.threads,
-        )  # fmt: skip
+        if self._wild is None:
+            config, every = self.config, round(_WILD_SECONDS / self.dt)
+            self._wild = wild_rollouts(
+                config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
+                nthread=config.rollouts.threads,
+            )  # fmt: skip
+        return self._wild
 
     def _make_policy(self) -> Policy:
         spec, config = envs.spec(self.config.env), self.config.policy

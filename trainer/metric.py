@@ -37,6 +37,8 @@ _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
 _MOST, _LEAST = 3.0, 0.3
 """Limits of a class's weight in the loss; classes are weighed to count equally."""
+_TINY = 1e-4
+"""Under the root: its slope must be finite where nothing differs."""
 _JUDGED_CLIPS = 2000
 
 
@@ -150,9 +152,6 @@ def _fit_one(
     with torch.no_grad():
         numbers = log_weights, _ascending(first, gaps), log_steepness.exp()[0]
     return tuple(x.detach().numpy().copy() for x in numbers), float(loss.detach())  # type: ignore[return-value]
-
-
-_TINY = 1e-4
 
 
 def _ascending(first: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:

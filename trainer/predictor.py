@@ -12,7 +12,7 @@ import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -184,7 +184,7 @@ def fit(
         ratings: n rated segments, all of W steps.
         frames: Index of the demo frame at each step of each segment, (n, W).
         view: The demo.
-        config: Which kind, and how.
+        config: Which kind, and how; a "metric" of a demo without a track is a "network".
         number: The snapshot's number.
         seed: Of everything random.
         device: Where torch computes; what is drawn at random is the same everywhere.
@@ -197,10 +197,9 @@ def fit(
     """
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
-    kind = config.kind
-    if kind == "metric" and view.track is None:
-        kind = "network"
-    module = importlib.import_module(KINDS[kind])
+    if config.kind == "metric" and view.track is None:
+        config = replace(config, kind="network")  # what is saved says how it is to be read
+    module = importlib.import_module(KINDS[config.kind])
     return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device)
 
 

@@ -64,7 +64,8 @@ class Step:
     clock: np.ndarray
     """Demo step before the step, (N,)."""
     elapsed: np.ndarray
-    """Control steps since the episode began, this one included, (N,)."""
+    """Control steps since the episode began, this one included, (N,); an episode that ``Starts`` at a
+    demo step counts from there."""
     next_obs: np.ndarray
     """After the step, before any reset, (N, o)."""
     next_qpos: np.ndarray
