@@ -61,6 +61,10 @@ class Simulated:
     """(segment, demo step) to a rating, 1..5, or None: declined, another clip is asked instead."""
 
 
+class _Stopped(Exception):
+    """The thread was told to end before it could begin."""
+
+
 class Trainer:
     """One run: its thread, its files, its place in the database.
 
@@ -185,6 +189,8 @@ class Trainer:
             try:
                 self._work()
                 return
+            except _Stopped:
+                self._tell_stopped()
             except Exception as error:
                 if self._simulated is not None:
                     raise
@@ -202,7 +208,7 @@ class Trainer:
         while not self._stop.is_set():
             self._ask(learner)
             if learner.env_steps >= limit:
-                self._tell("done", "The agent has practised as long as it was told to.")
+                self._tell("done", "The robot has practised as long as it was told to.")
                 if self._simulated is not None:
                     return
                 self._stop.wait(_TICK_S)
@@ -221,7 +227,7 @@ class Trainer:
                 self._stop.wait(_TICK_S)
             else:
                 self._iterate(learner)
-        self._tell("stopped", "The run is stopped. It can be started again where it was.")
+        self._tell_stopped()
 
     def _prepare(self) -> Learner:
         # The networks that learn are too small to be split: threads would wait for each other more than
@@ -264,8 +270,12 @@ class Trainer:
         if not self.config.predictor.appearance:
             return features, None
         self._tell("starting", "Looking at pictures of the robot: about a minute, the first time only.")
-        look = learn_appearance(self.config.env, self._encoder, self.cache_dir / "robots")
+        look = learn_appearance(self.config.env, self._encoder, self.cache_dir / "robots", self._check)
         return features, look.track(features, self.demo.fps) if look.knows(features) else None
+
+    def _check(self) -> None:
+        if self._stop.is_set():
+            raise _Stopped
 
     def _iterate(self, learner: Learner) -> None:
         began = self._work_began = time.monotonic()
@@ -424,6 +434,9 @@ class Trainer:
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")
+
+    def _tell_stopped(self) -> None:
+        self._tell("stopped", "The run is stopped. It can be started again where it was.")
 
     def _tell(self, phase: str, message: str, stats: dict | None = None) -> None:
         learner = self._learner
