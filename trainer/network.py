@@ -27,6 +27,8 @@ _JUDGED_CLIPS = 2000
 """Clips behind ``FitStats.accuracy``, at most: a refit must not grow with the ratings."""
 _BOOTSTRAP = 0.85
 """Share of the clips that each of several members sees."""
+_ORDINAL_FALL = 1.5
+"""Nats by which a rating is less right than the one next to it that is nearer to the one given."""
 
 
 def standard_inputs(obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -220,9 +222,6 @@ def _targets(classes_n: torch.Tensor, ordinal: bool) -> torch.Tensor:
         return functional.one_hot(classes_n, CLASSES).float()
     away = (torch.arange(CLASSES)[None] - classes_n[:, None]).abs().float()
     return functional.softmax(-_ORDINAL_FALL * away, dim=-1)
-
-
-_ORDINAL_FALL = 1.5
 
 
 def class_weights(counts: torch.Tensor) -> torch.Tensor:

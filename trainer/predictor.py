@@ -88,6 +88,10 @@ class View:
     """Principal components of the frame features, (F, V), float32."""
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
+    basis: np.ndarray
+    """Functions of the frames that an unknown track is made of (``trainer/imagined.py``), (F, R), float32."""
+    fps: float
+    """Frames per second."""
 
 
 class Snapshot(ABC):
@@ -197,10 +201,7 @@ def fit(
     """
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
-    kind = config.kind
-    if kind == "metric" and view.track is None:
-        kind = "network"
-    module = importlib.import_module(KINDS[kind])
+    module = importlib.import_module(KINDS[config.kind])
     return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device)
 
 

@@ -44,6 +44,7 @@ class Kind:
 
 KINDS = {
     "method": Kind("trainer.bench.method:run"),
+    "predictor": Kind("trainer.bench.predictor_trial:run"),
     "handcoded": Kind("trainer.bench.controls:handcoded"),
     "preferences": Kind("trainer.bench.controls:preferences"),
     "truth": Kind("trainer.bench.controls:truth"),
