@@ -151,10 +151,9 @@ def test_backflip(results, tmp_path):
     # With a sixth of the ratings, the distance that was learned knows the demo, the paper's network hardly.
     assert ours["demo_rated"] > ours["demo_shuffled"] + 1.5
     assert abs(paper["demo_rated"] - paper["demo_shuffled"]) < 1
-    # Questions in random states, chosen: no class is left out, and not most ratings are ones.
-    assert (
-        min(ours["ratings_by_class"]) >= 1 and ours["ratings_by_class"][0] < 30 < paper["ratings_by_class"][0]
-    )
+    # Questions about chosen moments of random states: fewer ones, more fours and fives.
+    assert ours["ratings_by_class"][0] < paper["ratings_by_class"][0]
+    assert sum(ours["ratings_by_class"][3:]) > sum(paper["ratings_by_class"][3:])
     # Practice of a few seconds: it moves like the demo more than it did, if by little.
     assert ours["figures"]["aligned_similarity"]["mean"] > 1.7
     assert text.count("missed") + text.count("met") >= 3 and "not run" not in text

@@ -135,9 +135,10 @@ def prepare(demo: Demo, config: RunConfig, cache: Path) -> Any:
     One job at a time: the others wait, and find it done.
     """
     encoder = make_encoder(config.encoder)
-    with hold(cache / "lock", wait=True):
+    with hold(cache / "demos" / "lock", wait=True):
         demo_features(demo, encoder, cache / "demos")
-        if config.predictor.appearance:
+    if config.predictor.appearance:
+        with hold(cache / "robots" / "lock", wait=True):
             learn_appearance(config.env, encoder, cache / "robots")
     return encoder
 

@@ -27,6 +27,8 @@ Groups = Mapping[str, Sequence[Outcome]]
 
 NOTE_BAND = "Line: mean over seeds; band: least to most of them; thin: each."
 
+_PAIRS = ("#2f5dc4", "#d97a1d")
+"""Colours where a label has two lines: the first of ``drawing.COLOURS``, whose module needs matplotlib."""
 _OF = 5
 """Seeds that goals are stated for."""
 _log = logging.getLogger(__name__)
@@ -137,13 +139,16 @@ def curves(
 
 
 def error_chart(groups: Groups) -> list[Chart]:
-    """Error of the states over time, as in the paper's figure 3 (c): best episode, and mean of 16."""
+    """Error of the states over time, as in the paper's figure 3 (c): best episode, and mean of 16.
+
+    Of at most two labels: more lines could not be told apart.
+    """
     lines: list[Line] = []
-    for label, group in groups.items():
+    for (label, group), colour in zip(groups.items(), _PAIRS, strict=False):
         found = [outcome.result["errors"] for outcome in group if outcome.result and outcome.result["errors"]]
         for part in ("best", "mean") if found else ():
             over_seeds = band([(errors["seconds"], errors[part]) for errors in found])
-            line = over_seeds.line(f"{label}, {part} of 16", dashed=part == "mean")
+            line = over_seeds.line(f"{label}, {part} of 16", dashed=part == "mean", colour=colour)
             lines.append(replace(line, each=()))  # too lively to be told apart
     chart = Chart(
         name="state_error", title="Error of the states against the demo's", x_label="time, s",
