@@ -7,7 +7,7 @@ MEANINGS = (
     "Nothing about the robot reminds you of the video.",
     "One thing fits, such as the direction, but the rest does not.",
     "About half of it fits.",
-    "Nearly right. The pose, the direction or the timing is a little off.",
+    "Nearly right. The pose, the direction or the pace is a little off.",
     "You could take one for the other.",
 )
 """The same, for the guide."""
