@@ -10,6 +10,9 @@ point is lost:
 the ordered logit of McCullagh 1980 (proportional odds) on a distance. 23 numbers in all, so a few dozen
 ratings fit it; a network of thousands has to learn first that near is like.
 
+A fit that starts from the numbers of another move (they say what the rater looks at, not what the demo
+shows) is pulled to them, the less the more ratings there are.
+
 Shapes: n clips, W control steps a clip, F demo frames, B = 18 body numbers (pose and motion), M members.
 """
 
@@ -24,6 +27,7 @@ from torch.nn import functional
 
 from trainer import body
 from trainer.appearance import Track
+from trainer.errors import UserError
 from trainer.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
 from trainer.store import RatedSegment
 
@@ -35,6 +39,9 @@ _PRIOR = np.repeat([-1.0, -2.0], body.POSE)
 """Log weights before any rating: a difference in pose counts more than one in motion."""
 _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
+_TRUST = 2.0
+"""Of the penalty that holds all numbers near those of a start, over the number of ratings. As a prior it
+is a standard deviation of 0.5: another move's weights are taken to be right within a factor of 1.6."""
 _MOST, _LEAST = 3.0, 0.3
 """Limits of a class's weight in the loss; classes are weighed to count equally."""
 _JUDGED_CLIPS = 2000
@@ -57,24 +64,35 @@ class MetricSnapshot(Snapshot):
         thresholds: np.ndarray, steepness: np.ndarray,
     ) -> None:  # fmt: skip
         super().__init__(number=number, config=config)
+        self.log_weights, self.thresholds, self.steepness = log_weights, thresholds, steepness
         self._track = track
         self._demo = np.concatenate([track.pose, track.motion], axis=-1)
-        self._log_weights, self._thresholds, self._steepness = log_weights, thresholds, steepness
         self._weights = np.exp(log_weights).T.astype(np.float32)
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As ``Snapshot.member_probabilities``; what the motors do does not matter."""
         distance = np.sqrt(np.square(self._demo[frames] - _body(obs)) @ self._weights + _TINY)
-        above = self._steepness[:, None] * (self._thresholds - distance[..., None])
+        above = self.steepness[:, None] * (self.thresholds - distance[..., None])
         above = 1 / (1 + np.exp(-np.clip(above, -30, 30)))  # (..., M, 4): P(y >= 5), ... P(y >= 2)
         whole = np.concatenate([np.zeros_like(above[..., :1]), above, np.ones_like(above[..., :1])], -1)
         return np.moveaxis(np.diff(whole, axis=-1)[..., ::-1], -2, 0).astype(np.float32)
 
+    def beside(self, view: View) -> MetricSnapshot:
+        """As ``Snapshot.beside``."""
+        if view.track is None:
+            raise UserError(
+                "a predictor of kind 'metric' compares poses, and this demo shows no robot it knows"
+            )
+        return MetricSnapshot(
+            number=0, config=self.config, track=view.track, log_weights=self.log_weights,
+            thresholds=self.thresholds, steepness=self.steepness,
+        )  # fmt: skip
+
     def tensors(self) -> dict[str, Any]:
         """The fitted numbers and the demo's track."""
         arrays = {
-            "pose": self._track.pose, "motion": self._track.motion, "log_weights": self._log_weights,
-            "thresholds": self._thresholds, "steepness": self._steepness,
+            "pose": self._track.pose, "motion": self._track.motion, "log_weights": self.log_weights,
+            "thresholds": self.thresholds, "steepness": self.steepness,
         }  # fmt: skip
         return {name: torch.from_numpy(np.asarray(array)) for name, array in arrays.items()}
 
@@ -91,9 +109,13 @@ def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> Metri
 
 def fit(
     ratings: Sequence[RatedSegment], frames: np.ndarray, view: View, config: PredictorConfig,
-    *, number: int, seed: int, device: str = "cpu",
+    *, number: int, seed: int, device: str = "cpu", start: Snapshot | None = None,
 ) -> tuple[MetricSnapshot, FitStats]:  # fmt: skip
-    """Fits ``config.members`` distances by Adam, each on a bootstrap. As ``predictor.fit``."""
+    """Fits ``config.members`` distances by Adam, each on a bootstrap. As ``predictor.fit``.
+
+    With a start, member i begins with the numbers of the start's member i and is pulled back to them.
+    """
+    assert start is None or isinstance(start, MetricSnapshot), "predictor.fit has checked it"
     assert view.track is not None, "a metric compares poses"
     generator = torch.Generator().manual_seed(seed)
     demo = np.concatenate([view.track.pose, view.track.motion], axis=-1)
@@ -103,11 +125,11 @@ def fit(
     counts = torch.bincount(classes_n, minlength=CLASSES).float()
     weights_n = (len(ratings) / (CLASSES * counts)).clamp(_LEAST, _MOST)[classes_n]
     members, losses = [], []
-    for _ in range(config.members):
+    for k in range(config.members):
         chosen = torch.arange(len(ratings))
         if config.members > 1:
             chosen = torch.randint(len(ratings), (len(ratings),), generator=generator)
-        member, loss = _fit_one(squares_nWB[chosen], classes_n[chosen], weights_n[chosen])
+        member, loss = _fit_one(squares_nWB[chosen], classes_n[chosen], weights_n[chosen], _known(start, k))
         members.append(member)
         losses.append(loss)
     log_weights, thresholds, steepness = (np.stack(column) for column in zip(*members, strict=True))
@@ -124,18 +146,32 @@ def fit(
     return snapshot, FitStats(loss=float(np.mean(losses)), accuracy=float(hit.mean()))
 
 
+def _known(start: MetricSnapshot | None, member: int) -> tuple[torch.Tensor, ...] | None:
+    """The free numbers of a start's member, as ``_fit_one`` has them."""
+    if start is None:
+        return None
+    member %= len(start.steepness)
+    thresholds = torch.from_numpy(start.thresholds[member].astype(np.float32))
+    return (
+        torch.from_numpy(start.log_weights[member].astype(np.float32)),
+        thresholds[:1],
+        thresholds.diff().clamp_min(_TINY).expm1().log(),  # softplus backwards
+        torch.tensor([float(np.log(start.steepness[member]))]),
+    )
+
+
 def _fit_one(
-    squares_nWB: torch.Tensor, classes_n: torch.Tensor, weights_n: torch.Tensor
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float]:
+    squares_nWB: torch.Tensor, classes_n: torch.Tensor, weights_n: torch.Tensor,
+    known: tuple[torch.Tensor, ...] | None,
+) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], float]:  # fmt: skip
     prior = torch.from_numpy(_PRIOR.astype(np.float32))
-    log_weights = prior.clone().requires_grad_()
-    first = torch.tensor([0.9], requires_grad=True)
-    gaps = torch.zeros(CLASSES - 2, requires_grad=True)
-    log_steepness = torch.ones(1, requires_grad=True)
-    optimiser = torch.optim.Adam([log_weights, first, gaps, log_steepness], _RATE, fused=True)
+    first = prior, torch.tensor([0.9]), torch.zeros(CLASSES - 2), torch.ones(1)
+    numbers = [x.clone().requires_grad_() for x in known or first]
+    log_weights, first_threshold, gaps, log_steepness = numbers
+    optimiser = torch.optim.Adam(numbers, _RATE, fused=True)
     loss = torch.zeros(())
     for _ in range(_UPDATES):
-        thresholds = _ascending(first, gaps)
+        thresholds = _ascending(first_threshold, gaps)
         distance_n = (squares_nWB @ log_weights.exp() + _TINY).sqrt().mean(dim=1)
         logits = log_steepness.exp() * (thresholds - distance_n[:, None])
         above = torch.sigmoid(logits.flip(-1))  # P(y >= 2), ... P(y >= 5)
@@ -143,13 +179,17 @@ def _fit_one(
         chances = torch.cat([one, above], -1) - torch.cat([above, 0 * one], -1)
         given = chances.gather(1, classes_n[:, None])[:, 0].clamp_min(1e-4)
         loss = -(weights_n * given.log()).mean()
-        penalty = _PULL * (log_weights - prior).square().sum()
+        if known is None:
+            penalty = _PULL * (log_weights - prior).square().sum()
+        else:
+            off = [(x - x0).square().sum() for x, x0 in zip(numbers, known, strict=True)]
+            penalty = _TRUST / len(classes_n) * torch.stack(off).sum()
         optimiser.zero_grad()
         (loss + penalty).backward()
         optimiser.step()
     with torch.no_grad():
-        numbers = log_weights, _ascending(first, gaps), log_steepness.exp()[0]
-    return tuple(x.detach().numpy().copy() for x in numbers), float(loss.detach())  # type: ignore[return-value]
+        fitted = log_weights, _ascending(first_threshold, gaps), log_steepness.exp()[0]
+    return tuple(x.detach().numpy().copy() for x in fitted), float(loss.detach())  # type: ignore[return-value]
 
 
 _TINY = 1e-4
