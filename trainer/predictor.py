@@ -134,13 +134,13 @@ class Snapshot(ABC):
             (members, ..., 5), float32, for ratings 1 to 5.
         """
 
-    @abstractmethod
     def beside(self, view: View) -> Snapshot:
         """The same predictor beside another demo, as snapshot 0: what is known before the first rating.
 
         Raises:
-            UserError: If the demo shows something that this predictor cannot see.
+            UserError: If predictors of this kind cannot start another run.
         """
+        raise UserError(f"a run cannot start from a predictor of kind {self.config.kind!r}")
 
     @abstractmethod
     def tensors(self) -> dict[str, Any]:
@@ -230,9 +230,9 @@ def fit(
     """
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
-    config = replace(config, kind=kind_for(view, config))
     if start is not None:
         check_start(start, view, config)
+    config = replace(config, kind=kind_for(view, config))
     module = importlib.import_module(KINDS[config.kind])
     return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device, start=start)
 

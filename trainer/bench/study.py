@@ -44,6 +44,8 @@ class Kind:
 
 KINDS = {
     "method": Kind("trainer.bench.method:run"),
+    "transfer": Kind("trainer.bench.transfer:run"),
+    "person": Kind("trainer.bench.person:run"),
     "handcoded": Kind("trainer.bench.controls:handcoded"),
     "preferences": Kind("trainer.bench.controls:preferences"),
     "truth": Kind("trainer.bench.controls:truth"),
