@@ -55,7 +55,7 @@ def _whole(seed: int) -> list[Job]:
         method_job(_ON_CLEAN, seed, demo=_CLEAN, steps=STEPS),
         method_job(_FEW, seed, ratings=100, steps=STEPS),
         method_job(_ERRS, seed, rater="oracle+mistake:0.1+jitter", steps=STEPS),
-        method_job(_BLIND, seed, steps=STEPS, predictor__appearance=False),
+        method_job(_BLIND, seed, steps=STEPS, changes={"predictor.appearance": False}),
         _control("truth", _TRUTH_ELASTIC, seed, method="onedemo", steps=STEPS),
         _control("truth", _TRUTH_FIXED, seed, method="paper", steps=STEPS),
         _control("handcoded", _HAND, seed, steps=BASELINE_STEPS),

@@ -50,7 +50,7 @@ _ERROR_EVERY = 10
 
 def method_job(
     label: str, seed: int, *, demo: str = "hopper-backflip", method: str = "onedemo", rater: str = "oracle",
-    ratings: int = 350, steps: int, **settings: Any,
+    ratings: int = 350, steps: int, changes: Mapping[str, Any] | None = None,
 ) -> Job:  # fmt: skip
     """A job of kind "method"; the same arguments give the same job in every table.
 
@@ -62,11 +62,13 @@ def method_job(
         rater: Name of a simulated rater.
         ratings: Its budget.
         steps: Control steps of practice.
-        **settings: More settings, ``section__key=value``.
+        changes: More settings, by their dotted names.
     """
-    more = {key.replace("__", "."): value for key, value in settings.items()}
-    about = {"demo": demo, "method": method, "rater": rater, "ratings": ratings, "steps": steps, "set": more}
-    return Job(kind="method", label=label, settings=about, seed=seed)
+    settings = {
+        "demo": demo, "method": method, "rater": rater, "ratings": ratings, "steps": steps,
+        "set": dict(changes or {}),
+    }  # fmt: skip
+    return Job(kind="method", label=label, settings=settings, seed=seed)
 
 
 def run(
