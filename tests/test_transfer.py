@@ -186,6 +186,19 @@ def test_before_the_first_rating_the_start_chooses():
     assert liked[1] > liked[0] + 0.15
 
 
+def test_a_learner_fits_from_a_metric():
+    view, ratings, frames = poses(60, 0, matters=0)
+    start, _ = fit(ratings, frames, view, METRIC, number=1, seed=0)
+    rated = ratings[:5]
+    ends = []
+    for first in (None, start):
+        learner = Learner(small_config(method="onedemo"), FRAMES, 30.0, first)
+        learner.look_at(walk(0), view.track)
+        ends.append(learner.fit(rated, 1)[0])
+    scratch, tuned = (np.abs(np.mean(s.log_weights - start.log_weights.mean(0), 0)).max() for s in ends)
+    assert tuned < 0.5 * scratch
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     return falling_demo(tmp_path_factory.mktemp("demo"))

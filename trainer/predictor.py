@@ -117,6 +117,9 @@ class Snapshot(ABC):
         config: How it was fitted.
     """
 
+    lens: Lens | None = None
+    """What it sees the frames through, if it sees visual inputs."""
+
     def __init__(self, *, number: int, config: PredictorConfig) -> None:
         self.number = number
         self.config = config
