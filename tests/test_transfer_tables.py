@@ -118,8 +118,8 @@ def test_a_strip_shows_the_same_moments_of_both(tmp_path):
 
 
 @pytest.mark.seam
-def test_transfer(tmp_path):
-    found, text = run(transfer_table, tmp_path / "results", tmp_path)
+def test_transfer(results, tmp_path):
+    found, text = run(transfer_table, results, tmp_path)
     tuned, scratch = (found[THERE.label("onedemo", t)] for t in (True, False))
     assert tuned["ratings"] == scratch["ratings"] == 20 and tuned["source"]["ratings"] == 40
     assert tuned["curve"]["env_steps"] == scratch["curve"]["env_steps"]
@@ -131,10 +131,10 @@ def test_transfer(tmp_path):
 
 
 @pytest.mark.seam
-def test_person(tmp_path):
+def test_person(results, tmp_path):
     if not has_video():
         pytest.skip(f"there is no ../shared/videos/{person.VIDEO}")
-    found, text = run(person_table, tmp_path / "results", tmp_path)
+    found, text = run(person_table, results, tmp_path)
     ours = found["onedemo"]
     assert ours["ratings"] == 30 and len(ours["ratings_by_class"]) == 5
     assert sum(n > 0 for n in ours["ratings_by_class"]) >= 3, "the rater tells clips apart"
