@@ -164,6 +164,9 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--run", dest="run_name", metavar="NAME", help="go on with this run, or name a new one"
     )
+    parser.add_argument(
+        "--method", choices=("onedemo", "paper"), help="how to learn: onedemo (default), or as in the paper"
+    )
     parser.add_argument("--seed", type=int, metavar="N", help="of all random numbers (0)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
     parser.add_argument(
@@ -175,11 +178,15 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--encoder-weights", type=Path, metavar="FILE", help="instead of fetching them")
 
 
+_SETTINGS = ("method", "seed", "device", "encoder")
+"""Options that are settings of a run."""
+
+
 def _config(arguments: argparse.Namespace) -> Any:
     from trainer.config import load_config, parse_override
 
     overrides = dict(parse_override(text) for text in arguments.settings)
-    for key in ("seed", "device", "encoder"):
+    for key in _SETTINGS:
         if getattr(arguments, key) is not None:
             overrides[key] = getattr(arguments, key)
     ratings = getattr(arguments, "ratings", None)
@@ -204,10 +211,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
         config=config,
         explicit=bool(arguments.settings)
-        or any(
-            given is not None
-            for given in (arguments.config, arguments.seed, arguments.device, arguments.encoder)
-        ),
+        or any(getattr(arguments, key) is not None for key in ("config", *_SETTINGS)),
         encoder_weights=arguments.encoder_weights,
         host=arguments.host,
         port=arguments.port,

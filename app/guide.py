@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("onedemo.page")
 
 _KEYS = (
-    (("1", "2", "3", "4", "5"), "rate the attempt; the next one follows at once"),
+    (("1", "2", "3", "4", "5"), "rate the pair; the next one follows at once"),
     (("U",), "take your last rating back, as often as you like (also Backspace)"),
     (("S",), "skip this one"),
     (("Space",), "play it again from the start"),
@@ -66,10 +66,11 @@ def guide_html(examples: dict[str, Example]) -> str:
         for names, text in _KEYS
     )
     return (
-        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is trying to learn a move from '
-        "one video. You see about a third of a second of the video, and beside it the robot’s attempt at "
-        "the same piece. Say how similar the two movements are: your ratings tell the robot what to "
-        "practise.</p></header>"
+        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is learning a move from one video. '
+        "You see two short movements, about a third of a second each, both at real speed. Left: a moment of "
+        "the video. Right: something the robot did. How alike are they? Your ratings tell the robot what to "
+        "practise.</p><p>You need not know the move, or where in it a moment belongs: only these two "
+        "movements count. At first the robot moves at random, so most pairs deserve a 1.</p></header>"
         f'<section><h2>What the numbers mean</h2><ol class="od-scale">{scale}</ol></section>'
         f"<section><h2>Examples from this demonstration</h2>{_examples_html(examples)}</section>"
         '<section class="od-two"><div><h2>What to look at</h2><ul class="od-points">'

@@ -51,6 +51,19 @@ def chromium() -> Iterator[Any]:
         browser.close()
 
 
+@pytest.fixture(scope="session")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
+    from trainer import appearance
+    from trainer.encoders import make_encoder
+
+    directory = tmp_path_factory.mktemp("looked") / "robots"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(appearance, "PICTURES", 300)
+        appearance.learn("hopper", make_encoder("efficientnet-lite0"), directory)
+    return directory
+
+
 @dataclass
 class Site:
     """A running front with a page and a trainer behind it."""

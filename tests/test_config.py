@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from trainer.config import RunConfig, load_config, parse_override, to_toml
+from trainer.config import METHODS, RunConfig, load_config, parse_override, to_toml
 from trainer.errors import UserError
 
 
@@ -43,6 +43,17 @@ def test_overrides_beat_the_file(tmp_path):
         ("[ratings]\nonline = -1", "ratings.online must be at least 0, got -1"),
         ("[predictor]\nsampling = 'often'", "predictor.sampling must be"),
         ("[rollouts]\nphysics = 'gpu'", "rollouts.physics must be 'mujoco' or 'warp', got 'gpu'"),
+        ("method = 'papers'", "method must be one of onedemo, paper, got 'papers'"),
+        ("[ratings]\nstarts = 'flying'", "ratings.starts must be one of random, standing, got 'flying'"),
+        ("[ratings]\npairing = 'x'", "ratings.pairing must be one of any, time, got 'x'"),
+        ("[ratings]\nchoice = 'x'", "ratings.choice must be one of mix, uniform, got 'x'"),
+        ("[ratings]\nrounds = 0", "ratings.rounds must be at least 1, got 0"),
+        ("[predictor]\nkind = 'x'", "predictor.kind must be one of network, metric, got 'x'"),
+        ("[predictor]\nmembers = 0", "predictor.members must be at least 1, got 0"),
+        ("[practice]\nbank_share = 2", "practice.bank_share must be in 0..1, got 2"),
+        ("[practice]\nelastic = 1", "practice.elastic must be true or false, got 1"),
+        ("[policy]\nkind = 'x'", "policy.kind must be one of clock, table"),
+        ("[trpo]\nfinal_kl = 0", "trpo.final_kl must be > 0 nats, got 0"),
         ("seed = ", "not valid TOML"),
     ],
 )
@@ -76,3 +87,67 @@ def test_whole_numbers_serve_as_numbers():
 def test_config_is_frozen():
     with pytest.raises(AttributeError):
         RunConfig().seed = 3  # type: ignore[misc]
+
+
+# Methods
+
+
+def value_at(config, dotted):
+    for name in dotted.split("."):
+        config = getattr(config, name)
+    return config
+
+
+@pytest.mark.parametrize("key", METHODS["paper"])
+def test_the_paper_differs_from_onedemo_in_every_key_it_names(key):
+    paper, onedemo = load_config(None, {"method": "paper"}), load_config()
+    assert value_at(paper, key) == METHODS["paper"][key]
+    assert value_at(onedemo, key) != METHODS["paper"][key]
+    assert type(value_at(onedemo, key)) is type(METHODS["paper"][key])
+
+
+def test_onedemo_is_the_default_and_sets_nothing():
+    assert load_config() == load_config(None, {"method": "onedemo"}) == RunConfig()
+    assert METHODS["onedemo"] == {}
+
+
+def test_a_method_changes_nothing_that_it_does_not_name():
+    paper = load_config(None, {"method": "paper"})
+    changed = {key for key in flat(paper) if value_at(paper, key) != value_at(RunConfig(), key)}
+    assert changed == {"method", *METHODS["paper"]}
+
+
+def flat(config, prefix=""):
+    """Dotted names of all settings."""
+    names = []
+    for name in config.__dataclass_fields__:
+        value = getattr(config, name)
+        nested = hasattr(value, "__dataclass_fields__")
+        names += flat(value, f"{prefix}{name}.") if nested else [prefix + name]
+    return names
+
+
+@pytest.mark.parametrize("key", METHODS["paper"])
+def test_each_switch_of_onedemo_can_be_set_in_the_paper(key):
+    switched = load_config(None, {"method": "paper", key: value_at(RunConfig(), key)})
+    paper = load_config(None, {"method": "paper"})
+    assert {k for k in flat(paper) if value_at(switched, k) != value_at(paper, k)} == {key}
+
+
+def test_the_method_of_a_file_yields_to_the_files_own_values(tmp_path):
+    file = tmp_path / "c.toml"
+    file.write_text("method = 'paper'\n[practice]\nelastic = true\n[predictor]\nmembers = 5\n")
+    config = load_config(file)
+    assert config.practice.elastic and config.predictor.members == 5
+    assert config.practice.bank_share == 0 and config.predictor.kind == "network"
+    assert load_config(file, {"practice.elastic": False}).practice.elastic is False
+    back = load_config(file, {"method": "onedemo"})
+    assert back.predictor.kind == "metric" and back.predictor.members == 5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_with_a_method_is_recorded_whole(tmp_path, method):
+    config = load_config(None, {"method": method, "trpo.final_kl": 0.02, "practice.give_up": 0.2})
+    file = tmp_path / "config.toml"
+    file.write_text(to_toml(config))
+    assert load_config(file) == config

@@ -20,7 +20,9 @@ QUICK = paper(updates=400, visual_dims=8)
 @pytest.fixture(scope="module")
 def visual():
     features = np.random.default_rng(0).normal(size=(FRAMES, 40)).cumsum(axis=0)
-    return View(visual=visual_inputs(features, 8), track=None)
+    return View(
+        visual=visual_inputs(features, 8), track=None, basis=np.ones((FRAMES, 1), np.float32), fps=30.0
+    )
 
 
 def world(count, seed, skew=False):
@@ -187,6 +189,60 @@ def test_class_weights_by_hand():
     # 8 ratings in 3 classes present: weight = 8 / (3 * count); an absent class weighs nothing.
     weights = class_weights(torch.tensor([4, 2, 2, 0, 0]))
     torch.testing.assert_close(weights, torch.tensor([8 / 12, 8 / 6, 8 / 6, 0.0, 0.0]))
+
+
+def asked(snapshot, ratings, frames):
+    """Probabilities of each member for the middle of each clip, (members, n, 5)."""
+    obs, actions = (np.stack([getattr(r.segment, n)[19] for r in ratings]) for n in ("obs", "actions"))
+    return snapshot.member_probabilities(frames[:, 19], obs, actions)
+
+
+def test_members_differ_and_are_averaged(visual):
+    ratings, frames = world(60, seed=0)
+    config = paper(members=3, updates=100, visual_dims=8)
+    snapshot, stats = fit(ratings, frames, visual, config, number=1, seed=0)
+    members = asked(snapshot, ratings, frames)
+    assert members.shape == (3, 60, 5)
+    assert np.abs(members[0] - members[1]).mean() > 0.01 < np.abs(members[1] - members[2]).mean()
+    one = ratings[0].segment
+    np.testing.assert_allclose(
+        snapshot.probabilities(frames[0], one.obs, one.actions),
+        snapshot.member_probabilities(frames[0], one.obs, one.actions).mean(axis=0),
+    )
+    assert np.isfinite(stats.loss)
+
+
+def test_each_member_is_spared_some_of_the_ratings(visual):
+    """So they can disagree: with one rating of 5 among many of 1, one that never saw it expects none."""
+    ratings, frames = world(300, seed=0)
+    fives, ones = ([i for i, r in enumerate(ratings) if r.value == value] for value in (5, 1))
+    some = [fives[0], *ones[:30]]
+    config = paper(members=12, updates=60, visual_dims=8)
+    snapshot, _ = fit([ratings[i] for i in some], frames[some], visual, config, number=1, seed=0)
+    expected = asked(snapshot, [ratings[fives[0]]], frames[fives[:1]])[:, 0] @ np.arange(1, 6)
+    assert expected.min() < 1.5 and np.median(expected) > 3
+
+
+def test_an_ordinal_fit_holds_neighbours_for_likelier(visual):
+    ratings, frames = world(300, seed=0)
+    chances = {}
+    for ordinal in (True, False):
+        config = paper(ordinal=ordinal, updates=900, visual_dims=8)
+        snapshot, stats = fit(ratings, frames, visual, config, number=1, seed=0)
+        assert stats.accuracy > 0.5
+        best = [i for i, r in enumerate(ratings) if r.value == 5]
+        chances[ordinal] = asked(snapshot, [ratings[i] for i in best], frames[best])[0].mean(axis=0)
+    assert (np.diff(chances[True]) > 0).all()  # from 1 to 5, each likelier than the one before
+    assert chances[True][3] > chances[False][3] and chances[True][4] < chances[False][4]
+
+
+def test_saved_members_are_the_same(visual, tmp_path):
+    ratings, frames = world(20, seed=0)
+    config = paper(members=2, updates=20, visual_dims=8)
+    snapshot, _ = fit(ratings, frames, visual, config, number=4, seed=0)
+    snapshot.save(tmp_path / "4.pt")
+    again = Snapshot.load(tmp_path / "4.pt")
+    np.testing.assert_array_equal(asked(again, ratings, frames), asked(snapshot, ratings, frames))
 
 
 @pytest.mark.parametrize("change", [{"sampling": "x"}, {"reward": "x"}, {"hidden": 0}, {"learning_rate": 0}])

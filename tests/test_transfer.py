@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from app.cli import main
 from trainer import body
 from trainer.appearance import Track
 from trainer.errors import UserError
+from trainer.imagined import track_basis
 from trainer.learner import Learner
 from trainer.loop import Simulated, Trainer
 from trainer.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
@@ -27,7 +30,7 @@ def walk(seed, features=40):
 
 
 def through(lens, features):
-    return View(visual=lens.see(features), track=None, lens=lens)
+    return View(visual=lens.see(features), track=None, lens=lens, basis=track_basis(features, 30.0), fps=30.0)
 
 
 def probabilities(snapshot, ratings, frames):
@@ -99,6 +102,8 @@ def poses(count, seed, matters):
     shown[:, 0] = 1.2
     view = View(
         visual=np.zeros((FRAMES, 1), np.float32),
+        basis=np.ones((FRAMES, 1), np.float32),
+        fps=30.0,
         track=Track(pose=body.pose(shown).astype(np.float32), motion=body.motion(shown).astype(np.float32)),
     )
     ratings = []
@@ -141,13 +146,10 @@ def test_a_start_of_another_kind_or_size_is_refused():
     view, posed, at = poses(10, 0, matters=0)
     with pytest.raises(UserError, match="of kind 'network', and this run fits one of kind 'metric'"):
         fit(posed, at, view, METRIC, number=1, seed=0, start=network)
-    metric, _ = fit(posed, at, view, METRIC, number=1, seed=0)
-    with pytest.raises(UserError, match="this demo does not show the robot"):
-        fit(ratings, frames, seen, METRIC, number=1, seed=0, start=metric)
     wide = PredictorConfig(kind="network", hidden=32)
     with pytest.raises(UserError, match=r"predictor\.hidden = 64, this run has 32"):
         fit(ratings, frames, seen, wide, number=1, seed=0, start=network)
-    blind = View(visual=seen.visual[:, :4], track=None)
+    blind = View(visual=seen.visual[:, :4], track=None, basis=seen.basis, fps=30.0)
     with pytest.raises(UserError, match="sees 8 numbers of a frame, this run 4"):
         fit(ratings, frames, blind, quick, number=1, seed=0, start=network)
     learner = Learner(small_config(), FRAMES, 30.0, network)
@@ -155,19 +157,24 @@ def test_a_start_of_another_kind_or_size_is_refused():
         learner.look_at(walk(0, features=20))
 
 
-@pytest.mark.parametrize("kind", ["network", "metric"])
+@pytest.mark.parametrize("kind", ["network", "metric", "imagined"])
 def test_a_saved_start_is_the_same_start(kind, tmp_path):
-    if kind == "network":  # what a metric becomes where the demo shows another body
-        config, view = PredictorConfig(updates=20, members=2), through(fit_lens(walk(0), 8), walk(0))
+    if kind == "network":
+        config, view = replace(NETWORK, updates=20), through(fit_lens(walk(0), 8), walk(0))
         ratings, frames = world(20, seed=0)
     else:
         config, (view, ratings, frames) = METRIC, poses(20, 0, matters=0)
+        view = view if kind == "metric" else replace(view, track=None)
     start, _ = fit(ratings, frames, view, config, number=3, seed=0)
     start.save(tmp_path / "s.pt")
     loaded = Snapshot.load(tmp_path / "s.pt")
-    assert loaded.config.kind == kind and loaded.number == 3
     ends = [fit(ratings[:7], frames[:7], view, config, number=1, seed=0, start=s)[0] for s in (start, loaded)]
-    np.testing.assert_array_equal(*(probabilities(s, ratings, frames) for s in ends))
+    scratch, _ = fit(ratings[:7], frames[:7], view, config, number=1, seed=0)
+    ends = [probabilities(s, ratings, frames) for s in (*ends, scratch)]
+    np.testing.assert_array_equal(ends[0], ends[1])
+    assert np.abs(ends[0] - ends[2]).max() > 0.01
+    # Before the first rating nothing is known of what cannot be seen.
+    assert (loaded.beside(view) is None) == (kind == "imagined")
 
 
 def test_before_the_first_rating_the_start_chooses():

@@ -168,6 +168,37 @@ def test_the_step_stays_in_the_trust_region_and_uses_it(max_kl):
         assert stats.kl == pytest.approx(kl, rel=1e-3, abs=1e-7)
 
 
+def largest_step(config, progress):
+    """The longest of a few steps at one moment of a training, as measured afterwards, nats."""
+    policy = small_policy()
+    trpo = Trpo(policy, config, seed=0)
+    longest = 0.0
+    for seed in range(5):
+        rollouts = made_up_rollouts(policy, seed=seed)
+        inputs = torch.from_numpy(rollouts.inputs).flatten(0, 1)
+        with torch.no_grad():
+            old_mean, old_log_std = policy(inputs), policy.log_std.clone()
+        assert trpo.update(rollouts, towards_the_first_state(rollouts), progress=progress).accepted
+        with torch.no_grad():
+            kl = mean_kl(old_mean, old_log_std, policy(inputs), policy.log_std).item()
+        longest = max(longest, kl)
+    return longest
+
+
+def test_the_trust_region_shrinks_over_a_training():
+    config = TrpoConfig(max_kl=0.1, final_kl=0.01, gamma=0.0)
+    for progress, radius in ((0.0, 0.1), (0.5, 0.055), (0.9, 0.019), (1.0, 0.01)):
+        longest = largest_step(config, progress)
+        assert 0.6 * radius < longest <= 1.0001 * radius, progress
+
+
+def test_the_trust_region_never_grows():
+    """Whoever asks for a small radius and no other has it all the time."""
+    config = TrpoConfig(max_kl=0.004, gamma=0.0)
+    assert config.final_kl > config.max_kl
+    assert 0.0024 < largest_step(config, 1.0) <= 0.004 * 1.0001
+
+
 def test_learns_what_it_is_paid_for():
     policy = small_policy(log_std=0.0)
     trpo = Trpo(policy, TrpoConfig(max_kl=0.05, gamma=0.0), seed=0)
@@ -323,6 +354,7 @@ def test_bad_input():
         trpo.update(rollouts, np.full((8, 100), np.nan))
     for name, value in {
         "max_kl": 0,
+        "final_kl": 0,
         "gamma": 1.0,
         "lam": 1.1,
         "damping": -1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,15 +10,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from trainer import envs
+from trainer import body, envs
+from trainer.appearance import Track
 from trainer.config import load_config
 from trainer.hidden import HiddenStates, hidden_path, save_hidden
 from trainer.motion import joint_points
 from trainer.records import Demo
+from trainer.render import Renderer
 from trainer.video import write_webm
 
 STEPS = 250
 FRAMES = 60
+FRAME_STEPS = np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)
+"""The control step that each frame shows."""
 
 
 class Thumbnail:
@@ -35,6 +40,26 @@ class Thumbnail:
 
 def falling_demo(directory: Path, seed: int = 0) -> Demo:
     """A hopper that waves its motors and falls, drawn as a stick figure; its states lie beside the video."""
+    hidden = falling_states(seed)
+    return _as_demo(directory, hidden, [_stick_figure(qpos) for qpos in hidden.qpos[FRAME_STEPS]])
+
+
+def drawn_demo(directory: Path, seed: int = 0) -> Demo:
+    """The same fall as the robot's own pictures show it; needs a machine that can draw."""
+    hidden = falling_states(seed)
+    with Renderer() as renderer:
+        return _as_demo(directory, hidden, list(renderer.render(hidden.qpos[FRAME_STEPS])))
+
+
+def falling_track(seed: int = 0) -> Track:
+    """What a perfect eye would see in the demo."""
+    obs = falling_states(seed).obs[FRAME_STEPS]
+    return Track(pose=body.pose(obs).astype(np.float32), motion=body.motion(obs).astype(np.float32))
+
+
+@functools.cache
+def falling_states(seed: int = 0) -> HiddenStates:
+    """The states of the fall, STEPS + 1 of them."""
     env = envs.make("hopper", 1, horizon=STEPS + 1, nthread=0)
     obs, _ = env.reset(seed=seed)
     states = [(obs[0], env.qpos[0], env.qvel[0])]
@@ -44,22 +69,24 @@ def falling_demo(directory: Path, seed: int = 0) -> Demo:
         states.append((obs[0], env.qpos[0], env.qvel[0]))
     env.close()
     columns = [np.array(column) for column in zip(*states, strict=True)]
-    hidden = HiddenStates(obs=columns[0], actions=actions, qpos=columns[1], qvel=columns[2])
-    steps = np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)
-    frames = [_stick_figure(hidden.qpos[step]) for step in steps]
+    return HiddenStates(obs=columns[0], actions=actions, qpos=columns[1], qvel=columns[2])
+
+
+def _as_demo(directory: Path, hidden: HiddenStates, frames: list[np.ndarray]) -> Demo:
     directory.mkdir(parents=True, exist_ok=True)
     video = directory / "falling.webm"
     write_webm(video, frames, fps=30.0)
     save_hidden(hidden_path(video), hidden)
     sha256 = hashlib.sha256(video.read_bytes()).hexdigest()
+    height, width, _ = frames[0].shape
     return Demo(
-        name="falling", sha256=sha256, path=video, fps=30.0, frames=FRAMES, width=160, height=120,
+        name="falling", sha256=sha256, path=video, fps=30.0, frames=FRAMES, width=width, height=height,
         task="backflip",
     )  # fmt: skip
 
 
 def small_config(**overrides):
-    """Settings under which a whole run takes seconds."""
+    """Settings under which a whole run takes seconds, of the paper's method unless told otherwise."""
     small = {
         "method": "paper",
         "ratings.pretrain": 12,

@@ -14,7 +14,7 @@ import hashlib
 import io
 import logging
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,8 @@ _MEMBERS = 3
 _EPOCHS = 25
 _BATCH = 64
 _RATE = 2e-3
+_DROPPED = 0.2
+_NOISE = 0.1
 _VERSION = 4  # raise it when what is drawn or how it is learned changes
 _SMOOTH = np.array([1.0, 2.0, 1.0]) / 4
 _AROUND = 2
@@ -101,13 +103,18 @@ class Appearance:
         return Track(pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32))
 
 
-def learn(env_name: str, encoder: Encoder, cache_dir: Path) -> Appearance:
+def _go_on() -> None:
+    """Lets everything run to its end."""
+
+
+def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on) -> Appearance:
     """Learns what the robot looks like, or takes what was learned before.
 
     Args:
         env_name: The robot.
         encoder: Looks at the pictures.
         cache_dir: Where it is kept, by robot and encoder.
+        check: Called every now and then; what it raises ends the learning.
 
     Raises:
         UserError: If this machine cannot draw.
@@ -121,14 +128,16 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path) -> Appearance:
                 return Appearance(stored)
         except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
             _log.warning("%s is damaged (%s): made anew", path, error)
-    appearance = regress(*pictures(env_name, encoder, PICTURES))
+    appearance = regress(*pictures(env_name, encoder, PICTURES, check), check)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)
     write_atomic(path, buffer.getvalue())
     return appearance
 
 
-def pictures(env_name: str, encoder: Encoder, count: int) -> tuple[np.ndarray, np.ndarray]:
+def pictures(
+    env_name: str, encoder: Encoder, count: int, check: Callable[[], None] = _go_on
+) -> tuple[np.ndarray, np.ndarray]:
     """Draws and encodes what random actions do from random and from standing starts.
 
     States that physics has run on for a while look like those of a demo: parts rest on the ground,
@@ -145,17 +154,36 @@ def pictures(env_name: str, encoder: Encoder, count: int) -> tuple[np.ndarray, n
     qpos = rollouts.qpos[:, ::every].reshape(-1, rollouts.qpos.shape[-1])
     qpos = np.random.default_rng(_SEED).permutation(qpos)[:count]
     with RenderThread() as drawing:  # a thread of its own: those of the encoder take turns at asking
-        features = encoder.encode(drawing.render(q[None]).result()[0] for q in qpos)
+
+        def drawn() -> Iterator[np.ndarray]:
+            for q in qpos:
+                check()
+                yield drawing.render(q[None]).result()[0]
+
+        features = encoder.encode(drawn())
     return features, body.pose(qpos[:, 1:]).astype(np.float32)
 
 
-def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
+def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> Appearance:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
+
+    One thread computes: several would add up in another order, and runs with another number of
+    ``rollouts.threads`` would see other poses. They would also be slower, as the networks are small.
 
     Args:
         features: (n, D).
         poses: (n, P).
+        check: Called before each pass over the pictures; what it raises ends the fit.
     """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _regress(features, poses, check)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None]) -> Appearance:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
     inputs, targets = torch.from_numpy((features - mean) / std), torch.from_numpy(poses)
@@ -168,6 +196,7 @@ def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
         optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-2, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
         for _ in range(_EPOCHS):
+            check()
             for index in torch.randperm(train, generator=generator).split(_BATCH):
                 seen = inputs[index]
                 # Features that are missing or off must not matter: dropout and noise of our own generator.
@@ -184,10 +213,6 @@ def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
     spread = np.square(poses[train:] - poses[train:].mean(axis=0)).sum(axis=0)
     appearance.held_out = appearance.tensors["held_out"] = 1 - error / spread
     return appearance
-
-
-_DROPPED = 0.2
-_NOISE = 0.1
 
 
 def _network(features: int) -> nn.Sequential:
@@ -207,8 +232,8 @@ def _draw_weights(net: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _smooth(x: np.ndarray) -> np.ndarray:
-    """A moving average along time, (F, ...); the ends repeat."""
-    padded = np.concatenate([x[:1], x, x[-1:]])
+    """A moving average along time, (F, ...), F > 1. Past the ends it goes on as it came."""
+    padded = np.concatenate([2 * x[:1] - x[1:2], x, 2 * x[-1:] - x[-2:-1]])
     return np.sum([weight * padded[i : i + len(x)] for i, weight in enumerate(_SMOOTH)], axis=0)
 
 

@@ -60,8 +60,8 @@ def choose(
         judge: What the predictor says of a clip beside the demo, if there is one.
 
     Returns:
-        ``count`` questions, fewer if the rollouts hold fewer places to cut. No two overlap unless
-        there is no other way.
+        ``count`` questions, fewer if the rollouts hold fewer places to cut. No two overlap, and they
+        spread over the demo, unless there is no other way; they crowd before they overlap.
     """
     lanes, starts = _places(rollouts, clip_steps)
     if not len(lanes):
@@ -107,19 +107,19 @@ def _take(
 ) -> None:  # fmt: skip
     """Appends to ``chosen`` from the front of ``rank`` until there are ``wanted``.
 
-    First without clips that overlap others, or crowd one part of the demo; if that is not enough, any.
+    First without clips that overlap others or, if they are to ``spread``, crowd one part of the demo; if
+    that is not enough, clips that crowd; then any.
     """
-    for strict in (True, False):
+    for separate, loose in ((True, spread), (True, False), (False, False)):
         for index in rank:
             if len(chosen) >= wanted:
                 return
             if index in chosen:
                 continue
-            if strict:
-                others = np.array(chosen, int)
-                close = np.abs(starts[others] - starts[index]) < clip_steps
-                if (close & (lanes[others] == lanes[index])).any():
-                    continue
-                if spread and (np.abs(demo[others] - demo[index]) < _APART).sum() >= _MOST_THERE:
-                    continue
+            others = np.array(chosen, int)
+            close = np.abs(starts[others] - starts[index]) < clip_steps
+            if separate and (close & (lanes[others] == lanes[index])).any():
+                continue
+            if loose and (np.abs(demo[others] - demo[index]) < _APART).sum() >= _MOST_THERE:
+                continue
             chosen.append(int(index))

@@ -61,9 +61,8 @@ def summarise(
 
 def perform(learner: Learner, snapshot: Snapshot | None) -> Episodes:
     """The 16 episodes of the current policy; the snapshot moves an elastic clock."""
-    return perform_policy(
-        learner.policy(), env_name=learner.config.env, rules=learner.rules(EPISODES, snapshot)
-    )
+    rules = learner.rules(EPISODES, snapshot) if snapshot is not None else None
+    return perform_policy(learner.policy(), env_name=learner.config.env, rules=rules)
 
 
 def perform_policy(

@@ -19,6 +19,7 @@ from trainer.appearance import Track
 from trainer.choice import Question, choose
 from trainer.config import RunConfig
 from trainer.errors import UserError
+from trainer.imagined import track_basis
 from trainer.policy import Policy, PolicySnapshot, check_device
 from trainer.practice import PracticeRules, fill_bank
 from trainer.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
@@ -68,6 +69,7 @@ class Learner:
         self._view: View | None = None
         self._start = start
         self._first: Snapshot | None = None  # the start beside this demo
+        self._fps = fps
         self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
         self._policy = self._make_policy().to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
@@ -90,9 +92,15 @@ class Learner:
             UserError: If the predictor to start from is of another kind, or was fitted with another encoder.
         """
         lens = self._lens(features)
-        self._view = View(visual=lens.see(features), track=track, lens=lens)
+        self._view = View(
+            visual=lens.see(features),
+            track=track,
+            basis=track_basis(features, self._fps),
+            fps=self._fps,
+            lens=lens,
+        )
         if self._start is not None:
-            check_start(self._start, self._view, self.config.predictor)
+            check_start(self._start, self.config.predictor)
             self._first = self._start.beside(self._view)
         if self.config.policy.kind == "table":
             if track is not None:
@@ -114,7 +122,7 @@ class Learner:
         """
         config = self.config
         if config.ratings.starts == "random":
-            return self._wild_rollouts()
+            return self._wild_rollouts()  # the bank picks from the same
         collector = self._make_collector(_RANDOM_LANES, seed=config.seed + 1, stagger=False)
         return collector.collect(self._make_policy().snapshot(), self.demo_steps)
 
@@ -240,9 +248,8 @@ class Learner:
             return
         bank = None
         if self.config.practice.bank_share:
-            self._wild = self._wild or self._wild_rollouts()
             rng = np.random.default_rng([self.config.seed, snapshot.number])
-            bank = fill_bank(snapshot, self._wild, self.frames_of, self.demo_steps, rng)
+            bank = fill_bank(snapshot, self._wild_rollouts(), self.frames_of, self.demo_steps, rng)
         rules.use(snapshot, bank)
         self._banked = snapshot.number
 
@@ -259,11 +266,13 @@ class Learner:
         return lens
 
     def _wild_rollouts(self) -> Transitions:
-        config, every = self.config, round(_WILD_SECONDS / self.dt)
-        return wild_rollouts(
-            config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
-            nthread=config.rollouts.threads,
-        )  # fmt: skip
+        if self._wild is None:
+            config, every = self.config, round(_WILD_SECONDS / self.dt)
+            self._wild = wild_rollouts(
+                config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
+                nthread=config.rollouts.threads,
+            )  # fmt: skip
+        return self._wild
 
     def _make_policy(self) -> Policy:
         spec, config = envs.spec(self.config.env), self.config.policy

@@ -31,6 +31,8 @@ _BOOTSTRAP = 0.85
 _TUNED = 0.3
 """Share of the learning rate with which a network from another move is fine-tuned: its ratings are many
 more than the new ones, so what it knows should not be thrown about."""
+_ORDINAL_FALL = 1.5
+"""Nats by which a rating is less right than the one next to it that is nearer to the one given."""
 
 
 def standard_inputs(obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -256,9 +258,6 @@ def _targets(classes_n: torch.Tensor, ordinal: bool) -> torch.Tensor:
         return functional.one_hot(classes_n, CLASSES).float()
     away = (torch.arange(CLASSES)[None] - classes_n[:, None]).abs().float()
     return functional.softmax(-_ORDINAL_FALL * away, dim=-1)
-
-
-_ORDINAL_FALL = 1.5
 
 
 def class_weights(counts: torch.Tensor) -> torch.Tensor:

@@ -54,7 +54,7 @@ class PracticeConfig:
     """How far the elastic clock may be from real time, either way."""
     bank_share: float = 0.5
     """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
-    give_up: float = 0.15
+    give_up: float = 0.25
     """An episode ends when the running similarity, 0..1, falls below this; 0: never."""
 
     def __post_init__(self) -> None:
@@ -145,6 +145,7 @@ class PracticeRules(EpisodeRules):
         self._snapshot: Snapshot | None = None
         self._bank: Bank | None = None
         self._running = np.full(lanes, _FRESH)
+        self._age = np.zeros(lanes, np.int64)
         self._similar = np.zeros(lanes)
         self._rewards: list[np.ndarray] = []
         self.mean_similarity = 0.0
@@ -163,7 +164,7 @@ class PracticeRules(EpisodeRules):
 
     def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:
         """States of the bank for a share of the lanes; the others stand."""
-        self._running[lanes] = _FRESH
+        self._running[lanes], self._age[lanes] = _FRESH, 0
         if self._bank is None:
             return None
         lanes = lanes[rng.random(len(lanes)) < self._config.bank_share]
@@ -183,12 +184,11 @@ class PracticeRules(EpisodeRules):
             self._similar = self._similarity(clock, step)
             moved = np.ones(len(clock))
         else:
-            candidates = step.clock + _MOVES[:, None]
+            moves = _MOVES[:, None]
+            candidates = step.clock + moves
             similar = self._similarity(candidates, step)
-            value = similar - _MOVE_COST * np.abs(_MOVES - 1)[:, None]
-            ahead = step.clock - (step.elapsed - 1)
-            value[0] = np.where(ahead <= -self._slack, -np.inf, value[0])
-            value[2:] = np.where(ahead >= self._slack, -np.inf, value[2:])
+            too_far = (np.abs(candidates - step.elapsed) > self._slack) & (moves != 1)
+            value = np.where(too_far, -np.inf, similar - _MOVE_COST * np.abs(moves - 1))
             moved = value.argmax(axis=0)
             clock = step.clock + moved
             self._similar = np.take_along_axis(similar, moved[None], axis=0)[0]
@@ -199,15 +199,16 @@ class PracticeRules(EpisodeRules):
     def stop(self, step: Step, next_clock: np.ndarray) -> np.ndarray:
         """True where the robot has been unlike the demo for a while."""
         self._running += (self._similar - self._running) / _MEMORY
-        return (self._running < self._config.give_up) & (step.elapsed > _GRACE)
+        self._age += 1  # not ``elapsed``, which begins in the middle of the demo with a state of the bank
+        return (self._running < self._config.give_up) & (self._age > _GRACE)
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed practice needs besides snapshot and bank."""
-        return {"running": torch.from_numpy(self._running.copy())}
+        return {"running": torch.from_numpy(self._running.copy()), "age": torch.from_numpy(self._age.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on where ``state_dict`` was taken."""
-        self._running = state["running"].numpy().copy()
+        self._running, self._age = state["running"].numpy().copy(), state["age"].numpy().copy()
 
     def _similarity(self, clock: np.ndarray, step: Step) -> np.ndarray:
         """0..1, the shape of ``clock``: states after the step against the demo there."""

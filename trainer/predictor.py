@@ -12,7 +12,7 @@ import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +105,10 @@ class View:
     """Principal components of the frame features, (F, V), float32."""
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
+    basis: np.ndarray
+    """Functions of the frames that an unknown track is made of (``trainer/imagined.py``), (F, R), float32."""
+    fps: float
+    """Frames per second."""
     lens: Lens | None = None
     """How ``visual`` was made of the features; needed if another run is to start from the predictor."""
 
@@ -137,8 +141,11 @@ class Snapshot(ABC):
             (members, ..., 5), float32, for ratings 1 to 5.
         """
 
-    def beside(self, view: View) -> Snapshot:
+    def beside(self, view: View) -> Snapshot | None:
         """The same predictor beside another demo, as snapshot 0: what is known before the first rating.
+
+        Returns:
+            None where nothing is: what the demo shows has to be learned from ratings first.
 
         Raises:
             UserError: If predictors of this kind cannot start another run.
@@ -234,27 +241,19 @@ def fit(
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
     if start is not None:
-        check_start(start, view, config)
-    config = replace(config, kind=kind_for(view, config))
+        check_start(start, config)
     module = importlib.import_module(KINDS[config.kind])
     return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device, start=start)
 
 
-def kind_for(view: View, config: PredictorConfig) -> str:
-    """The kind that is fitted: a metric needs to know what the frames show of the robot."""
-    return "network" if config.kind == "metric" and view.track is None else config.kind
-
-
-def check_start(start: Snapshot, view: View, config: PredictorConfig) -> None:
-    """Raises UserError if fits beside this demo cannot start from ``start``."""
-    kind = kind_for(view, config)
-    if start.config.kind != kind:
+def check_start(start: Snapshot, config: PredictorConfig) -> None:
+    """Raises UserError if fits of this config cannot start from ``start``."""
+    if start.config.kind != config.kind:
         raise UserError(
             f"the predictor to start from is of kind {start.config.kind!r}, and this run fits one of kind "
-            f"{kind!r}; choose a run with --set predictor.kind={kind}"
-            + (", since this demo does not show the robot" if kind != config.kind else "")
+            f"{config.kind!r}; choose a run with --set predictor.kind={config.kind}"
         )
-    same = ("hidden", "additional_layer") if kind == "network" else ()
+    same = ("hidden", "additional_layer") if config.kind == "network" else ()
     for name in same:
         theirs, ours = getattr(start.config, name), getattr(config, name)
         if theirs != ours:

@@ -15,7 +15,7 @@ from trainer.motion import clearances
 from trainer.rollouts import Collector, EpisodeRules, Starts, Transitions
 
 _JOINTS = np.array([[-2.6, 0.05], [-2.6, 0.05], [-0.78, 0.78]])
-"""Range of thigh, leg and foot, radians: that of the model's joints, a little inside (hopper.xml)."""
+"""Range of thigh, leg and foot, radians: that of the model's joints (hopper.xml), whose stops are soft."""
 _HEIGHTS = (0.05, 1.9)
 """Metres, of the torso's centre."""
 _SPREADS = np.array([1.5, 2.0, 6.0, 4.0, 4.0, 4.0])
@@ -34,7 +34,7 @@ def random_states(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.
     Returns:
         Positions (n, q), x = 0, and velocities (n, v).
     """
-    kept: list[np.ndarray] = []
+    kept = [np.zeros((0, 6))]
     while sum(map(len, kept)) < count:
         qpos = np.zeros((2 * count, 6))
         qpos[:, 1] = rng.uniform(*_HEIGHTS, len(qpos))

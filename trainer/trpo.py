@@ -35,8 +35,8 @@ class TrpoConfig:
     """Trust-region radius, mean KL(old || new) over the batch, nats. Schulman et al. 2015 use 0.01;
     batches of 16 thousand steps and more bear longer steps."""
     final_kl: float = 0.01
-    """The radius at the end of a training; it shrinks in proportion to what has been practised, so that the
-    last steps refine and do not throw over."""
+    """The radius at the end of a training, nats, if that is less than ``max_kl``: it shrinks in proportion
+    to what has been practised, so that the last steps refine and do not throw over."""
     gamma: float = 0.99
     """Discount per control step, in [0, 1)."""
     lam: float = 0.97
@@ -132,7 +132,7 @@ class Trpo:
         Args:
             rollouts: What the current policy did.
             rewards_NT: Reward of each step, (N, T), any units.
-            progress: How much of the training is over, 0..1: moves the radius from ``max_kl`` to ``final_kl``.
+            progress: How much of the training is over, 0..1; it moves the radius to ``final_kl``.
 
         Returns:
             What the step did.
@@ -142,7 +142,8 @@ class Trpo:
         """
         if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
-        max_kl = self.config.max_kl + progress * (self.config.final_kl - self.config.max_kl)
+        final_kl = min(self.config.final_kl, self.config.max_kl)
+        max_kl = self.config.max_kl + progress * (final_kl - self.config.max_kl)
         device = self.policy.device
         inputs_Bf = torch.from_numpy(rollouts.inputs).flatten(0, 1).to(device)
         actions_Ba = torch.from_numpy(rollouts.actions).flatten(0, 1).to(device)

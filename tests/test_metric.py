@@ -1,0 +1,261 @@
+"""The learned distance against distances that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from trainer import body
+from trainer.appearance import Track
+from trainer.metric import MetricSnapshot
+from trainer.network import NetworkSnapshot
+from trainer.predictor import PredictorConfig, Snapshot, View, fit
+from trainer.records import Segment
+from trainer.starts import wild_rollouts
+from trainer.store import RatedSegment
+
+STEPS, FRAMES = 38, 60
+WEIGHTS = np.repeat([[1.0], [0.2]], body.POSE, axis=1)
+"""Of pose and motion: what this rater looks at. Torso alone in the motion, the foot not at all."""
+WEIGHTS[0, 7:] = 0.0
+WEIGHTS[1, :1] = WEIGHTS[1, 3:] = 0.0
+CONFIG = PredictorConfig(members=3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """As in a run: more would wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def rollouts():
+    return wild_rollouts("hopper", lanes=24, steps=400, every=100, seed=0, nthread=0)
+
+
+@pytest.fixture(scope="module")
+def view(rollouts):
+    """A demo that shows what lane 0 did, for two seconds."""
+    obs = rollouts.obs[0, :250][np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)]
+    track = Track(pose=body.pose(obs).astype(np.float32), motion=body.motion(obs).astype(np.float32))
+    visual = np.random.default_rng(0).normal(size=(FRAMES, 4)).astype(np.float32)
+    return View(visual=visual, track=track, basis=np.ones((len(visual), 1), np.float32), fps=30.0)
+
+
+def true_distance(view, frames, obs):
+    difference = np.stack(
+        [view.track.pose[frames] - body.pose(obs), view.track.motion[frames] - body.motion(obs)], axis=-2
+    )
+    return np.sqrt((WEIGHTS * np.square(difference)).sum(axis=(-1, -2)))
+
+
+def world(rollouts, view, count, seed):
+    """Clips at random beside random frames; a rating by fifths of the true distance. And that distance."""
+    rng = np.random.default_rng(seed)
+    clips, frames = [], []
+    for _ in range(count):
+        lane, start = int(rng.integers(1, 24)), 100 * int(rng.integers(4)) + int(rng.integers(62))
+        clips.append(rollouts.segment(lane, start, STEPS))
+        frames.append(int(rng.integers(FRAMES - 10)) + np.arange(STEPS) // 4)
+    frames = np.array(frames)
+    distance = true_distance(view, frames, np.stack([c.obs for c in clips])).mean(axis=1)
+    values = 5 - np.digitize(distance, [2.1, 2.5, 2.85, 3.2])
+    ratings = [
+        RatedSegment(event=i, demo_step=0, segment=clip, value=int(value))
+        for i, (clip, value) in enumerate(zip(clips, values, strict=True))
+    ]
+    return ratings, frames, distance
+
+
+def predicted(snapshot, ratings, frames):
+    obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
+    return snapshot.ratings(frames, obs, actions).mean(axis=1)
+
+
+def rank_correlation(a, b):
+    return np.corrcoef(np.argsort(np.argsort(a)), np.argsort(np.argsort(b)))[0, 1]
+
+
+@pytest.fixture(scope="module")
+def fitted(rollouts, view):
+    ratings, frames, _ = world(rollouts, view, 300, seed=0)
+    assert min(np.bincount([r.value for r in ratings])[1:]) > 15
+    return *fit(ratings, frames, view, CONFIG, number=1, seed=0), ratings, frames
+
+
+def test_it_finds_what_the_rater_looks_at(fitted):
+    snapshot, stats, *_ = fitted
+    log_weights = snapshot.tensors()["log_weights"].numpy().mean(axis=0)
+    gained = log_weights - np.repeat([-1.0, -2.0], body.POSE)  # what was taken for granted before any rating
+    seen = WEIGHTS.ravel() > 0
+    assert gained[seen].mean() > gained[~seen].mean() + 1.0
+    assert gained[1:7].min() > gained[7:9].max()  # torso, thigh and leg matter more than the foot
+    assert stats.accuracy > 0.6 and stats.loss < np.log(5) / 2
+
+
+def test_it_ranks_unseen_clips_as_the_true_distance_does(fitted, rollouts, view):
+    ratings, frames, distance = world(rollouts, view, 300, seed=1)
+    value = predicted(fitted[0], ratings, frames)
+    assert rank_correlation(value, -distance) > 0.95
+    truth = np.array([r.value for r in ratings])
+    assert np.abs(value - truth).mean() < 0.5
+    assert np.corrcoef(value, truth)[0, 1] > 0.9
+
+
+def test_a_few_ratings_do(rollouts, view):
+    unseen, unseen_frames, distance = world(rollouts, view, 300, seed=1)
+    ranks = []
+    for seed in range(3):
+        ratings, frames, _ = world(rollouts, view, 25, seed=10 + seed)
+        snapshot, _ = fit(ratings, frames, view, CONFIG, number=1, seed=0)
+        ranks.append(rank_correlation(predicted(snapshot, unseen, unseen_frames), -distance))
+    assert min(ranks) > 0.75 and np.mean(ranks) > 0.8
+
+
+def test_same_ratings_and_seed_give_the_same_fit_and_members_differ(fitted, view):
+    snapshot, stats, ratings, frames = fitted
+    again, same = fit(ratings, frames, view, CONFIG, number=1, seed=0)
+    other, _ = fit(ratings, frames, view, CONFIG, number=1, seed=1)
+    one, two, three = (x.tensors()["log_weights"] for x in (snapshot, again, other))
+    assert torch.equal(one, two) and stats == same
+    assert not torch.equal(one, three)
+    assert len(one) == 3 and not torch.equal(one[0], one[1])
+    alone, _ = fit(ratings, frames, view, replace(CONFIG, members=1), number=1, seed=0)
+    assert len(alone.tensors()["log_weights"]) == 1
+
+
+def test_a_fit_leaves_the_global_generator_alone(view, fitted):
+    torch.manual_seed(1)
+    expected = torch.rand(3)
+    torch.manual_seed(1)
+    fit(fitted[2][:5], fitted[3][:5], view, CONFIG, number=1, seed=0)
+    assert torch.equal(torch.rand(3), expected)
+
+
+@pytest.mark.parametrize("members", [1, 3])
+def test_absent_classes_do_no_harm(rollouts, view, members):
+    ratings, frames, distance = world(rollouts, view, 120, seed=2)
+    only = [i for i, r in enumerate(ratings) if r.value in (1, 3)]
+    config = replace(CONFIG, members=members)
+    snapshot, stats = fit([ratings[i] for i in only], frames[only], view, config, number=1, seed=0)
+    value = predicted(snapshot, ratings, frames)
+    assert np.isfinite(stats.loss) and np.isfinite(value).all()
+    assert rank_correlation(value, -distance) > 0.8
+    whole = snapshot.tensors()["thresholds"].numpy()
+    assert np.isfinite(whole).all() and (np.diff(whole, axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("value", [1, 3, 5])
+def test_one_rating_is_enough(rollouts, view, value):
+    ratings, frames, _ = world(rollouts, view, 1, seed=0)
+    one = [replace(ratings[0], value=value)]
+    snapshot, stats = fit(one, frames, view, CONFIG, number=1, seed=0)
+    assert np.isfinite(stats.loss) and stats.accuracy == 1.0
+    assert predicted(snapshot, one, frames)[0] == pytest.approx(value, abs=0.8)
+
+
+def test_probabilities_are_an_ordered_logit_of_the_distance(fitted, view):
+    snapshot, _, ratings, frames = fitted
+    obs = np.stack([r.segment.obs for r in ratings])
+    chances = snapshot.member_probabilities(frames, obs, np.zeros((*frames.shape, 3)))
+    assert chances.shape == (3, 300, STEPS, 5) and chances.dtype == np.float32
+    np.testing.assert_allclose(chances.sum(axis=-1), 1, atol=1e-5)
+    assert chances.min() >= 0
+    track = np.concatenate([view.track.pose, view.track.motion], axis=-1)
+    difference = track[frames] - np.concatenate([body.pose(obs), body.motion(obs)], axis=-1)
+    numbers = {name: x.numpy() for name, x in snapshot.tensors().items()}
+    for member in range(3):
+        weights = np.exp(numbers["log_weights"][member])
+        distance = np.sqrt(np.square(difference) @ weights + 1e-4).ravel()
+        at_least = chances[member, ..., ::-1].cumsum(axis=-1)[..., :4].reshape(-1, 4)  # P(y >= 5), ... (2)
+        steepness, thresholds = numbers["steepness"][member], numbers["thresholds"][member]
+        formula = 1 / (1 + np.exp(-steepness * (thresholds - distance[:, None])))
+        np.testing.assert_allclose(at_least, formula, atol=1e-4)
+        order = np.argsort(distance)
+        assert (np.diff(at_least[order], axis=0) <= 1e-5).all()  # farther is never better
+    np.testing.assert_allclose(
+        snapshot.probabilities(frames, obs, np.zeros((*frames.shape, 3))), chances.mean(axis=0), atol=1e-6
+    )
+
+
+def test_the_demos_own_states_are_rated_best(fitted, rollouts):
+    snapshot = fitted[0]
+    steps = np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)
+    obs, none = rollouts.obs[0, steps], np.zeros((FRAMES, 3))
+    own = snapshot.ratings(np.arange(FRAMES), obs, none)
+    others = snapshot.ratings(np.arange(FRAMES), obs[np.random.default_rng(0).permutation(FRAMES)], none)
+    assert own.min() > 4.5
+    assert others.mean() < 3.5
+
+
+def test_what_the_motors_do_does_not_matter_and_turns_do_not_count(fitted, rollouts):
+    snapshot, frames, obs = fitted[0], np.arange(20), rollouts.obs[3, :20]
+    expected = snapshot.ratings(frames, obs, np.zeros((20, 3)))
+    np.testing.assert_array_equal(snapshot.ratings(frames, obs, np.ones((20, 3))), expected)
+    turned = obs - 4 * np.pi * np.eye(11)[1]
+    np.testing.assert_allclose(snapshot.ratings(frames, turned, np.zeros((20, 3))), expected, atol=1e-5)
+
+
+def shapes_agree(snapshot, rollouts):
+    """Candidate frames (C, N) beside states (N, o), and one frame beside many: what practice asks."""
+    frames = np.random.default_rng(0).integers(FRAMES, size=(4, 7))
+    obs, actions = rollouts.obs[:7, 5], rollouts.actions[:7, 5]
+    together = snapshot.ratings(frames, obs, actions)
+    assert together.shape == (4, 7)
+    for row, shown in zip(together, frames, strict=True):
+        np.testing.assert_allclose(row, snapshot.ratings(shown, obs, actions), atol=1e-5)
+    one = snapshot.ratings(frames[:1, 0], obs, actions)
+    np.testing.assert_allclose(one, snapshot.ratings(np.repeat(frames[0, 0], 7), obs, actions), atol=1e-5)
+
+
+def test_frames_and_states_are_broadcast_against_each_other(fitted, rollouts, view):
+    shapes_agree(fitted[0], rollouts)
+    network = PredictorConfig(kind="network", updates=20, members=2)
+    shapes_agree(fit(fitted[2], fitted[3], view, network, number=1, seed=0)[0], rollouts)
+
+
+def test_judging_a_clip_is_the_mean_of_its_steps_and_the_members_quarrel(fitted):
+    snapshot, _, ratings, frames = fitted
+    obs, actions = (np.stack([getattr(r.segment, n) for r in ratings[:5]]) for n in ("obs", "actions"))
+    mean, doubt = snapshot.judge(frames[:5], obs, actions)
+    rated = snapshot.member_probabilities(frames[:5], obs, actions) @ np.arange(1, 6)  # (members, 5, W)
+    np.testing.assert_allclose(mean, predicted(snapshot, ratings[:5], frames[:5]), atol=1e-5)
+    np.testing.assert_allclose(doubt, rated.mean(axis=-1).std(axis=0), atol=1e-5)
+    assert doubt.min() > 0
+
+
+def test_a_saved_snapshot_is_the_same(fitted, tmp_path):
+    snapshot, _, ratings, frames = fitted
+    snapshot.save(tmp_path / "000001.pt")
+    again = Snapshot.load(tmp_path / "000001.pt")
+    assert isinstance(again, MetricSnapshot) and (again.number, again.config) == (1, CONFIG)
+    np.testing.assert_array_equal(predicted(again, ratings, frames), predicted(snapshot, ratings, frames))
+
+
+def test_where_no_pose_is_seen_a_network_is_fitted_and_saved_as_one(fitted, view, rollouts, tmp_path):
+    """A demo of another body: nothing to measure a distance to."""
+    *_, ratings, frames = fitted
+    config = replace(CONFIG, updates=20)
+    snapshot, _ = fit(ratings, frames, replace(view, track=None), config, number=2, seed=0)
+    assert isinstance(snapshot, NetworkSnapshot)
+    snapshot.save(tmp_path / "000002.pt")
+    again = Snapshot.load(tmp_path / "000002.pt")
+    assert isinstance(again, NetworkSnapshot) and again.config.members == 3
+    np.testing.assert_array_equal(predicted(again, ratings, frames), predicted(snapshot, ratings, frames))
+
+
+def test_an_empty_segment_list_is_refused(view):
+    with pytest.raises(ValueError, match="at least one rating"):
+        fit([], np.empty((0, STEPS), int), view, CONFIG, number=1, seed=0)
+
+
+def test_clips_as_short_as_one_step(view):
+    segment = Segment(
+        obs=np.zeros((1, 11)), actions=np.zeros((1, 3)), qpos=np.zeros((1, 6)), qvel=np.zeros((1, 6))
+    )
+    one = RatedSegment(event=0, demo_step=0, segment=segment, value=2)
+    assert np.isfinite(fit([one], np.zeros((1, 1), int), view, CONFIG, number=1, seed=0)[1].loss)
