@@ -75,6 +75,9 @@ def _parser() -> argparse.ArgumentParser:
         "--ratings", type=int, metavar="N", help="ratings in all, 4 of 7 before practice (350)"
     )
     train.add_argument("--steps", type=int, metavar="N", help="control steps of practice (10 million)")
+    train.add_argument(
+        "--predictor-from", metavar="RUN", help="start from what this run's predictor knows of another move"
+    )
     train.add_argument("--json", type=Path, metavar="FILE", help="write the summary there too")
     train.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -223,6 +226,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from trainer.files import write_atomic
     from trainer.headless import train
     from trainer.store import Store
+    from trainer.transfer import newest_snapshot
 
     config = _config(arguments)
     if arguments.json is not None:
@@ -230,6 +234,9 @@ def _train(arguments: argparse.Namespace) -> None:
     demo = find_demo(arguments.demo, arguments.data_dir / "demos")
     store = Store(arguments.data_dir)
     try:
+        start = None
+        if arguments.predictor_from is not None:
+            start = newest_snapshot(store, arguments.data_dir, arguments.predictor_from)
         summary = train(
             store=store,
             data_dir=arguments.data_dir,
@@ -239,6 +246,7 @@ def _train(arguments: argparse.Namespace) -> None:
             rater=arguments.rater,
             name=arguments.run_name,
             progress=not arguments.quiet,
+            start=start,
         )
     finally:
         store.close()

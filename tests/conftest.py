@@ -28,6 +28,12 @@ CHROMIUM_FLAGS = [
 
 
 @pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished runs of all tables, so that demo and robot are looked at once, and runs are shared."""
+    return tmp_path_factory.mktemp("results")
+
+
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
     names = ("chromium", "chromium-browser")

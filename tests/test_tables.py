@@ -124,12 +124,6 @@ def test_there_is_a_report_before_anything_was_run(table_module):
 # The quick forms
 
 
-@pytest.fixture(scope="module")
-def results(tmp_path_factory):
-    """One directory for all three, so that demo and robot are looked at once, and runs are shared."""
-    return tmp_path_factory.mktemp("results")
-
-
 def run(table_module, results, out):
     found = run_jobs(table_module.plan((SEED,), quick=True), results, tell=print)
     assert [outcome.reason for outcome in found if outcome.failed] == []

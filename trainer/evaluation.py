@@ -12,7 +12,16 @@ import numpy as np
 from trainer import envs
 from trainer.alignment import align
 from trainer.learner import Learner
-from trainer.motion import backflip_reward, clean_turns, hop_reward, landings, net_turns, until_fall
+from trainer.motion import (
+    backflip_reward,
+    clean_turns,
+    farthest_turn,
+    hop_reward,
+    landings,
+    net_turns,
+    turned,
+    until_fall,
+)
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
 from trainer.raters import Oracle, appearance
@@ -89,7 +98,9 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``backflip_reward``, with the actions clipped to what the motors do, and
           ``backflip_reward_raw_actions``.
         - ``net_turns``, ``clean_turns``, ``landings``: see ``trainer.motion``.
+        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``trainer.motion``.
         - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
+        - ``hop_reward``: the same rewards over the whole episode, falls or not.
         - ``upright_seconds``: until then.
     """
     qpos, qvel, actions = episodes.qpos, episodes.qvel, episodes.actions
@@ -107,6 +118,9 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         "net_turns": net_turns(qpos[..., 2]),
         "clean_turns": clean_turns(qpos),
         "landings": landings(qpos, dt),
+        "turned": turned(qpos[..., 2]),
+        "farthest_turn": farthest_turn(qpos[..., 2]),
+        "hop_reward": hops.sum(axis=-1),
         "hop_return": (hops * upright).sum(axis=-1),
         "upright_seconds": upright.sum(axis=-1) * dt,
     }

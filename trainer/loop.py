@@ -38,6 +38,7 @@ from trainer.render import RenderThread
 from trainer.rollouts import Acting, EpisodeRules, Transitions
 from trainer.store import NewClip, Store
 from trainer.training_set import TrainingSet
+from trainer.transfer import keep_start, snapshot_file
 
 log = logging.getLogger("onedemo")
 
@@ -79,6 +80,8 @@ class Trainer:
         simulated: Answers in place of people; None for people.
         cache_dir: Holds what is known of demos and robots for any run; the data directory if None.
         watch: Called in the trainer's thread after each iteration.
+        start: Snapshot of another run that this one's predictor starts from; a copy is kept, so a run
+            that goes on needs none.
     """
 
     def __init__(
@@ -94,11 +97,12 @@ class Trainer:
         simulated: Simulated | None = None,
         cache_dir: Path | None = None,
         watch: Callable[[Learner, Snapshot], None] | None = None,
+        start: Path | None = None,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
         self.cache_dir = cache_dir or data_dir
-        self._watch = watch
+        self._watch, self._start = watch, start
         self.directory = data_dir / "runs" / run
         self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
         self._learner: Learner | None = None
@@ -233,7 +237,10 @@ class Trainer:
         # The networks that learn are too small to be split: threads would wait for each other more than
         # they compute, the longer the busier the machine. Their first weights depend on the number, too.
         torch.set_num_threads(1)
-        learner = Learner(self.config, self.demo.frames, self.demo.fps)
+        begun = bool(self.store.snapshots(self.run))
+        start = keep_start(self.directory, self._start, begun=begun)
+        first = Snapshot.load(start, self.config.device) if start is not None else None
+        learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
         self._learner = learner
@@ -309,7 +316,7 @@ class Trainer:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
-        snapshot.save(self._snapshot_file(number))
+        snapshot.save(snapshot_file(self.directory, number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
         waiting = self.store.waiting_clips(self.run)
@@ -452,13 +459,10 @@ class Trainer:
 
     # Files
 
-    def _snapshot_file(self, number: int) -> Path:
-        return self.directory / "snapshots" / f"{number:06d}.pt"
-
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds."""
         for row in reversed(self.store.snapshots(self.run)):
-            file = self._snapshot_file(row["number"])
+            file = snapshot_file(self.directory, row["number"])
             if file.exists():
                 self._snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]

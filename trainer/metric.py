@@ -11,6 +11,9 @@ the ordered logit of McCullagh 1980 (proportional odds) on a distance. Where the
 to learn first that near is like. Where it is not, the track itself is fitted to the ratings, too
 (``trainer/imagined.py``).
 
+A fit that starts from the numbers of another move (they say what the rater looks at, not what the demo
+shows) is pulled to them, the less the more ratings there are.
+
 Shapes: n clips, W control steps a clip, F demo frames, B = 18 body numbers (pose and motion), M members.
 """
 
@@ -43,6 +46,9 @@ _PRIOR = np.repeat([-1.0, -2.0], body.POSE)
 """Log weights before any rating: a difference in pose counts more than one in motion."""
 _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
+_TRUST = 2.0
+"""Of the penalty that holds all numbers near those of a start, over the number of ratings. As a prior it
+is a standard deviation of 0.5: another move's weights are taken to be right within a factor of 1.6."""
 _MOST, _LEAST = 3.0, 0.3
 """Limits of a class's weight in the loss; classes are weighed to count equally."""
 _TINY = 1e-4
@@ -67,8 +73,8 @@ class MetricSnapshot(Snapshot):
         thresholds: np.ndarray, steepness: np.ndarray,
     ) -> None:  # fmt: skip
         super().__init__(number=number, config=config)
+        self.log_weights, self.thresholds, self.steepness = log_weights, thresholds, steepness
         self._tracks = tracks
-        self._log_weights, self._thresholds, self._steepness = log_weights, thresholds, steepness
         self._weights = np.exp(log_weights).astype(np.float32)
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -80,16 +86,25 @@ class MetricSnapshot(Snapshot):
             members = zip(self._tracks, self._weights, strict=True)
             squares = np.stack([np.square(track[frames] - robot) @ w for track, w in members], axis=-1)
         distance = np.sqrt(squares + _TINY)
-        above = self._steepness[:, None] * (self._thresholds - distance[..., None])
+        above = self.steepness[:, None] * (self.thresholds - distance[..., None])
         above = 1 / (1 + np.exp(-np.clip(above, -30, 30)))  # (..., M, 4): P(y >= 5), ... P(y >= 2)
         whole = np.concatenate([np.zeros_like(above[..., :1]), above, np.ones_like(above[..., :1])], -1)
         return np.moveaxis(np.diff(whole, axis=-1)[..., ::-1], -2, 0).astype(np.float32)
 
+    def beside(self, view: View) -> MetricSnapshot | None:
+        """As ``Snapshot.beside``; an imagined track cannot be known before the first rating."""
+        if view.track is None:
+            return None
+        return MetricSnapshot(
+            number=0, config=self.config, tracks=_seen(view)[None], log_weights=self.log_weights,
+            thresholds=self.thresholds, steepness=self.steepness,
+        )  # fmt: skip
+
     def tensors(self) -> dict[str, Any]:
         """The fitted numbers and the demo's tracks."""
         arrays = {
-            "tracks": self._tracks, "log_weights": self._log_weights,
-            "thresholds": self._thresholds, "steepness": self._steepness,
+            "tracks": self._tracks, "log_weights": self.log_weights,
+            "thresholds": self.thresholds, "steepness": self.steepness,
         }  # fmt: skip
         return {name: torch.from_numpy(np.asarray(array)) for name, array in arrays.items()}
 
@@ -124,12 +139,14 @@ class _Clips:
 
 def fit(
     ratings: Sequence[RatedSegment], frames: np.ndarray, view: View, config: PredictorConfig,
-    *, number: int, seed: int, device: str = "cpu",
+    *, number: int, seed: int, device: str = "cpu", start: Snapshot | None = None,
 ) -> tuple[MetricSnapshot, FitStats]:  # fmt: skip
     """Fits ``config.members`` distances by Adam, each on a bootstrap. As ``predictor.fit``.
 
     An imagined track may fit the same ratings in many ways: there are twice as many members then.
+    With a start, member i begins with the numbers of the start's member i and is pulled back to them.
     """
+    assert start is None or isinstance(start, MetricSnapshot), "predictor.fit has checked it"
     generator = torch.Generator().manual_seed(seed)
     seen = view.track is not None
     every = _EVERY if seen else _EVERY_IMAGINED
@@ -142,11 +159,11 @@ def fit(
         weights=(len(ratings) / (CLASSES * counts)).clamp(_LEAST, _MOST)[classes_n],
     )
     members, losses = [], []
-    for _ in range(config.members if seen else 2 * config.members):
+    for k in range(config.members if seen else 2 * config.members):
         chosen = torch.arange(len(ratings))
         if config.members > 1:
             chosen = torch.randint(len(ratings), (len(ratings),), generator=generator)
-        member, loss = _fit_one(clips.take(chosen), view, generator)
+        member, loss = _fit_one(clips.take(chosen), view, generator, _known(start, k))
         members.append(member)
         losses.append(loss)
     tracks, log_weights, thresholds, steepness = (np.stack(column) for column in zip(*members, strict=True))
@@ -163,19 +180,34 @@ def fit(
     return snapshot, FitStats(loss=float(np.mean(losses)), accuracy=float(hit.mean()))
 
 
-def _fit_one(clips: _Clips, view: View, generator: torch.Generator) -> tuple[tuple[np.ndarray, ...], float]:
+def _known(start: MetricSnapshot | None, member: int) -> tuple[torch.Tensor, ...] | None:
+    """The numbers of a start's member, the track left out, as they are free in a fit."""
+    if start is None:
+        return None
+    member %= len(start.steepness)
+    thresholds = torch.from_numpy(start.thresholds[member].astype(np.float32))
+    return (
+        torch.from_numpy(start.log_weights[member].astype(np.float32)),
+        thresholds[:1],
+        thresholds.diff().clamp_min(_TINY).expm1().log(),  # softplus backwards
+        torch.tensor([float(np.log(start.steepness[member]))]),
+    )
+
+
+def _fit_one(
+    clips: _Clips, view: View, generator: torch.Generator, known: tuple[torch.Tensor, ...] | None
+) -> tuple[tuple[np.ndarray, ...], float]:
     """One member: its track, log weights, thresholds and steepness, and the loss it ended with."""
     prior = torch.from_numpy(_PRIOR.astype(np.float32))
-    log_weights = prior.clone().requires_grad_()
-    first = torch.tensor([0.9], requires_grad=True)
-    gaps = torch.zeros(CLASSES - 2, requires_grad=True)
-    log_steepness = torch.ones(1, requires_grad=True)
-    parameters = [log_weights, first, gaps, log_steepness]
+    usual = prior, torch.tensor([0.9]), torch.zeros(CLASSES - 2), torch.ones(1)
+    numbers = [x.clone().requires_grad_() for x in known or usual]
+    log_weights, first, gaps, log_steepness = numbers
+    parameters = list(numbers)
     basis = torch.from_numpy(view.basis)
     places = torch.zeros(0)
     track = squares = torch.zeros(0)
     if view.track is not None:
-        track = torch.from_numpy(np.concatenate([view.track.pose, view.track.motion], axis=-1))
+        track = torch.from_numpy(_seen(view))
         squares = (track[clips.frames] - clips.robot).square()
     else:
         places = _SPREAD * torch.randn(basis.shape[1], body.POSE, generator=generator)
@@ -197,7 +229,12 @@ def _fit_one(clips: _Clips, view: View, generator: torch.Generator) -> tuple[tup
         chances = torch.cat([one, above], -1) - torch.cat([above, 0 * one], -1)
         given = chances.gather(1, clips.classes[:, None])[:, 0].clamp_min(1e-4)
         loss = -(clips.weights * given.log()).mean()
-        penalty = _PULL * (log_weights - prior).square().sum() + _RIDGE * places.square().sum()
+        if known is None:
+            penalty = _PULL * (log_weights - prior).square().sum()
+        else:
+            off = [(x - x0).square().sum() for x, x0 in zip(numbers, known, strict=True)]
+            penalty = _TRUST / len(clips.classes) * torch.stack(off).sum()
+        penalty = penalty + _RIDGE * places.square().sum()
         optimiser.zero_grad()
         (loss + penalty).backward()
         optimiser.step()
@@ -206,8 +243,14 @@ def _fit_one(clips: _Clips, view: View, generator: torch.Generator) -> tuple[tup
     with torch.no_grad():
         if view.track is None:
             track = track_of(basis, places, view.fps)
-        numbers = track, log_weights, _ascending(first, gaps), log_steepness.exp()[0]
-    return tuple(x.detach().numpy().copy() for x in numbers), float(loss.detach())
+        fitted = track, log_weights, _ascending(first, gaps), log_steepness.exp()[0]
+    return tuple(x.detach().numpy().copy() for x in fitted), float(loss.detach())
+
+
+def _seen(view: View) -> np.ndarray:
+    """The demo as its frames show it, (F, B)."""
+    assert view.track is not None
+    return np.concatenate([view.track.pose, view.track.motion], axis=-1)
 
 
 def _ascending(first: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:

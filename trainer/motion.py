@@ -48,6 +48,21 @@ def net_turns(torso_angle: np.ndarray) -> np.ndarray:
     return np.trunc((angle[..., 0] - angle[..., -1]) / (2 * np.pi)).astype(int)
 
 
+def turned(torso_angle: np.ndarray) -> np.ndarray:
+    """Backward rotation from the first state to the last in turns, (..., T) radians to (...), not rounded."""
+    angle = np.unwrap(torso_angle, axis=-1)
+    return (angle[..., 0] - angle[..., -1]) / (2 * np.pi)
+
+
+def farthest_turn(torso_angle: np.ndarray) -> np.ndarray:
+    """The farthest backward rotation between any two states in order, turns: (..., T) radians to (...).
+
+    A flip that starts from a forward lean, or after which the robot falls on its face, is seen whole.
+    """
+    angle = np.unwrap(torso_angle, axis=-1)
+    return (np.maximum.accumulate(angle, axis=-1) - angle).max(axis=-1) / (2 * np.pi)
+
+
 def clean_turns(qpos: np.ndarray) -> np.ndarray:
     """Backward turns made without any part but the foot touching the ground.
 

@@ -71,7 +71,10 @@ def method_job(
     return Job(kind="method", label=label, settings=settings, seed=seed)
 
 
-def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:
+def run(
+    settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None,
+    start: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Trains with a simulated rater and evaluates on the way and at the end.
 
     Args:
@@ -79,6 +82,7 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         seed: Of everything random.
         scratch: Takes the ratings and the run.
         cache: Holds what is known of demos and robots, for all jobs; the scratch directory if None.
+        start: Snapshot of another run that the predictor starts from.
 
     Returns:
         The result, see above. ``demo_rated`` is what the final predictor says of the demo's own states
@@ -97,6 +101,7 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         summary = train(
             store=store, data_dir=scratch, demo=demo, config=config, encoder=encoder,
             rater=settings["rater"], name="bench", progress=False, cache_dir=cache, watch=watch,
+            start=start,
         )  # fmt: skip
     finally:
         store.close()

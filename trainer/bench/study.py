@@ -44,6 +44,8 @@ class Kind:
 
 KINDS = {
     "method": Kind("trainer.bench.method:run"),
+    "transfer": Kind("trainer.bench.transfer:run"),
+    "person": Kind("trainer.bench.person:run"),
     "predictor": Kind("trainer.bench.predictor_trial:run"),
     "handcoded": Kind("trainer.bench.controls:handcoded"),
     "preferences": Kind("trainer.bench.controls:preferences"),
