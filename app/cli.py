@@ -75,6 +75,9 @@ def _parser() -> argparse.ArgumentParser:
         "--ratings", type=int, metavar="N", help="ratings in all, 4 of 7 before practice (350)"
     )
     train.add_argument("--steps", type=int, metavar="N", help="control steps of practice (10 million)")
+    train.add_argument(
+        "--predictor-from", metavar="RUN", help="start from what this run's predictor knows of another move"
+    )
     train.add_argument("--json", type=Path, metavar="FILE", help="write the summary there too")
     train.add_argument("--quiet", action="store_true", help="no progress bar")
 
@@ -161,6 +164,9 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--run", dest="run_name", metavar="NAME", help="go on with this run, or name a new one"
     )
+    parser.add_argument(
+        "--method", choices=("onedemo", "paper"), help="how to learn: onedemo (default), or as in the paper"
+    )
     parser.add_argument("--seed", type=int, metavar="N", help="of all random numbers (0)")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings in TOML")
     parser.add_argument(
@@ -172,11 +178,15 @@ def _run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--encoder-weights", type=Path, metavar="FILE", help="instead of fetching them")
 
 
+_SETTINGS = ("method", "seed", "device", "encoder")
+"""Options that are settings of a run."""
+
+
 def _config(arguments: argparse.Namespace) -> Any:
     from trainer.config import load_config, parse_override
 
     overrides = dict(parse_override(text) for text in arguments.settings)
-    for key in ("seed", "device", "encoder"):
+    for key in _SETTINGS:
         if getattr(arguments, key) is not None:
             overrides[key] = getattr(arguments, key)
     ratings = getattr(arguments, "ratings", None)
@@ -201,10 +211,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
         config=config,
         explicit=bool(arguments.settings)
-        or any(
-            given is not None
-            for given in (arguments.config, arguments.seed, arguments.device, arguments.encoder)
-        ),
+        or any(getattr(arguments, key) is not None for key in ("config", *_SETTINGS)),
         encoder_weights=arguments.encoder_weights,
         host=arguments.host,
         port=arguments.port,
@@ -219,6 +226,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from trainer.files import write_atomic
     from trainer.headless import train
     from trainer.store import Store
+    from trainer.transfer import newest_snapshot
 
     config = _config(arguments)
     if arguments.json is not None:
@@ -226,6 +234,9 @@ def _train(arguments: argparse.Namespace) -> None:
     demo = find_demo(arguments.demo, arguments.data_dir / "demos")
     store = Store(arguments.data_dir)
     try:
+        start = None
+        if arguments.predictor_from is not None:
+            start = newest_snapshot(store, arguments.data_dir, arguments.predictor_from)
         summary = train(
             store=store,
             data_dir=arguments.data_dir,
@@ -235,6 +246,7 @@ def _train(arguments: argparse.Namespace) -> None:
             rater=arguments.rater,
             name=arguments.run_name,
             progress=not arguments.quiet,
+            start=start,
         )
     finally:
         store.close()

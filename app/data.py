@@ -42,17 +42,18 @@ class Data:
         if event == self._counted:
             return
         self._counted = event
-        self._html.content = data_html(run, store.tallies(run), str(store.path.absolute()))
+        self._html.content = data_html(run, status.method, store.tallies(run), str(store.path.absolute()))
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""
 
 
-def data_html(run: str, counts: dict[tuple[str, str], list[int]], path: str) -> str:
+def data_html(run: str, method: str, counts: dict[tuple[str, str], list[int]], path: str) -> str:
     """The whole tab.
 
     Args:
         run: Whose ratings.
+        method: How it learns.
         counts: As ``Store.tallies``.
         path: Of the database.
     """
@@ -73,9 +74,10 @@ def data_html(run: str, counts: dict[tuple[str, str], list[int]], path: str) -> 
         if rows
         else '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
     )
+    where = f"in run <b>{escape(run)}</b>, method <b>{escape(method)}</b>"
     return (
         '<article class="od-data"><div class="od-data-top"><div><h1>Ratings</h1>'
-        f"<p>{total} rating{'' if total == 1 else 's'} in run <b>{escape(run)}</b></p></div>"
+        f"<p>{total} rating{'' if total == 1 else 's'} {where}</p></div>"
         '<a class="od-button od-primary" href="/export.csv" download>Download CSV</a></div>'
         f"{classes_html(classes)}<section><h3>By rater and stage</h3>{table}</section>"
         "<section><h3>Where they are</h3><p>Every rating is a row of the view <code>ratings</code> in this "

@@ -303,7 +303,7 @@ class Front:
         example = examples.get(request.match_info["name"])
         if example is None:
             raise web.HTTPNotFound()
-        return web.Response(body=example.webp, content_type="image/webp", headers=_KEEP)
+        return web.Response(body=example, content_type="image/webp", headers=_KEEP)
 
     async def _export(self, request: web.Request) -> web.StreamResponse:
         if request[_RATER].role != "researcher":

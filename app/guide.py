@@ -6,7 +6,6 @@ import logging
 import threading
 from typing import TYPE_CHECKING
 
-from app.pictures import Example
 from app.words import ANSWERS, MEANINGS
 from trainer.records import Status
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("onedemo.page")
 
 _KEYS = (
-    (("1", "2", "3", "4", "5"), "rate the attempt; the next one follows at once"),
+    (("1", "2", "3", "4", "5"), "rate the pair; the next one follows at once"),
     (("U",), "take your last rating back, as often as you like (also Backspace)"),
     (("S",), "skip this one"),
     (("Space",), "play it again from the start"),
@@ -30,7 +29,7 @@ class Guide:
 
     def __init__(self, session: Session) -> None:
         self._pictures = session.page.pictures
-        self._html = session.client.gui.add_html(guide_html({}))
+        self._html = session.client.gui.add_html(guide_html(examples=False))
         self._loading = False
 
     def show(self) -> None:
@@ -50,13 +49,14 @@ class Guide:
 
     def _load(self) -> None:
         try:
-            self._html.content = guide_html(self._pictures.examples())
+            self._pictures.examples()
+            self._html.content = guide_html(examples=True)
         except Exception:
             log.exception("the examples of the guide could not be made")
 
 
-def guide_html(examples: dict[str, Example]) -> str:
-    """The whole tab; without examples it still says what the numbers mean."""
+def guide_html(*, examples: bool) -> str:
+    """The whole tab; while the examples are not made yet it says what the numbers mean."""
     scale = "".join(
         f"<li><b>{value}</b><div><strong>{answer}</strong><span>{meaning}</span></div></li>"
         for value, (answer, meaning) in enumerate(zip(ANSWERS, MEANINGS, strict=True), start=1)
@@ -65,13 +65,15 @@ def guide_html(examples: dict[str, Example]) -> str:
         f"<li><span>{''.join(f'<kbd>{key}</kbd>' for key in names)}</span>{text}</li>"
         for names, text in _KEYS
     )
+    shown = _examples_html() if examples else _NO_EXAMPLES
     return (
-        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is trying to learn a move from '
-        "one video. You see about a third of a second of the video, and beside it the robot’s attempt at "
-        "the same piece. Say how similar the two movements are: your ratings tell the robot what to "
-        "practise.</p></header>"
+        '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is learning a move from one video. '
+        "You see two short movements, about a third of a second each, at real speed: a moment of the video, "
+        "and beside it something the robot did. How alike are they? Your ratings tell the robot what to "
+        "practise.</p><p>You need not know the move, or where in it a moment belongs: only these two "
+        "movements count. At first the robot moves at random, so most pairs deserve a 1.</p></header>"
         f'<section><h2>What the numbers mean</h2><ol class="od-scale">{scale}</ol></section>'
-        f"<section><h2>Examples from this demonstration</h2>{_examples_html(examples)}</section>"
+        f"<section><h2>Examples from this video</h2>{shown}</section>"
         '<section class="od-two"><div><h2>What to look at</h2><ul class="od-points">'
         "<li><b>Pose</b>: are the limbs bent and turned alike?</li>"
         "<li><b>Direction</b>: does it rise, fall and turn the same way?</li>"
@@ -82,25 +84,23 @@ def guide_html(examples: dict[str, Example]) -> str:
     )
 
 
-def _examples_html(examples: dict[str, Example]) -> str:
-    if not examples:
-        return '<p class="od-quiet" role="status">The examples are being made…</p>'
+_NO_EXAMPLES = '<p class="od-quiet" role="status">The examples are being made…</p>'
+
+
+def _examples_html() -> str:
     captions = {
         "same": ("5", "Twice the same moment."),
-        "near": ("4", "A moment that looks nearly alike"),
-        "other": ("2–3", "A moment with something in common"),
-        "far": ("1", "The moment that looks most different"),
+        "near": ("4", "Moments that look nearly alike."),
+        "other": ("2–3", "Moments with something in common."),
+        "far": ("1", "Moments with nothing in common."),
     }
     cards = ""
     for name, (value, text) in captions.items():
-        example = examples[name]
-        times = "" if name == "same" else f" ({example.other:.2f} s instead of {example.at:.2f} s)."
         cards += (
             f'<figure class="od-example"><div><img src="/demo/examples/{name}.webp" alt=""></div>'
-            f"<figcaption><b>{value}</b><span>{text}{times}</span></figcaption></figure>"
+            f"<figcaption><b>{value}</b><span>{text}</span></figcaption></figure>"
         )
     return (
-        '<p class="od-quiet">Both sides are from the demonstration itself; '
-        "the numbers are what we would give.</p>"
+        '<p class="od-quiet">Both sides are moments of the video; the numbers are what we would give.</p>'
         f'<div class="od-examples">{cards}</div>'
     )

@@ -1,7 +1,8 @@
 """The robot acting with the newest policy, in real time, for everybody who watches.
 
-One thread simulates one robot and hands each state to all watchers; while nobody watches it sleeps.
-It keeps no state that training could see.
+The demo beside it is where the run's rules put it: with an elastic clock it waits for the robot and
+hurries after it, as in practice. One thread simulates one robot and hands each state to all watchers;
+while nobody watches it sleeps. It keeps no state that training could see.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from trainer import envs
+from trainer.rollouts import Acting
 
 log = logging.getLogger("onedemo.page")
 
@@ -35,6 +36,8 @@ class Moment:
     """Their orientations, (bodies, 3, 3)."""
     x: float
     """Where the robot is along its track, metres."""
+    demo_seconds: float
+    """How far along the demo it is."""
     seconds: float
     """Since the episode began."""
     acting: bool
@@ -48,13 +51,15 @@ class Live:
     """The live robot of one run.
 
     Args:
-        policy: Gives the acting policy, or None while there is none.
+        acting: Gives what acts in the next episode, or None while there is nothing.
         seconds: Length of an episode: the demo's.
         environment: Name in the registry of environments.
     """
 
-    def __init__(self, policy: Callable[[], Any], seconds: float, environment: str = "hopper") -> None:
-        self._policy = policy
+    def __init__(
+        self, acting: Callable[[], Acting | None], seconds: float, environment: str = "hopper"
+    ) -> None:
+        self._acting = acting
         spec = envs.spec(environment)
         self.model_path = spec.xml
         self._dt = spec.dt
@@ -85,11 +90,13 @@ class Live:
         self._thread.join(timeout=5)
 
     def _run(self) -> None:
-        env = envs.make(self._environment, 1, horizon=self._horizon, nthread=0)
+        # One step more than an episode has: it is begun anew here, not by the environment.
+        env = envs.make(self._environment, 1, horizon=self._horizon + 1, nthread=0)
         model = mujoco.MjModel.from_xml_path(str(self.model_path))
         data = mujoco.MjData(model)
         obs, _ = env.reset(seed=0)
-        clock, policy = 0, self._policy()
+        acting: Acting | None = None
+        clock, elapsed = np.zeros(1, np.int32), 0
         due = time.monotonic()
         while True:
             with self._wake:
@@ -99,19 +106,22 @@ class Live:
                 if self._closing:
                     return
                 watchers = list(self._watchers.values())
+            if acting is None and (acting := self._acting()) is not None:
+                clock, elapsed = np.zeros(1, np.int32), 0
             for _ in range(steps_due(time.monotonic() - due, self._dt)):
                 due += self._dt
-                if clock == 0:
-                    policy = self._policy()  # One policy for a whole episode.
-                if policy is None:
-                    clock = (clock + 1) % self._horizon
+                if acting is None:  # the demo plays alone
+                    clock, elapsed = (clock + 1) % self._horizon, (elapsed + 1) % self._horizon
                     continue
-                actions = policy.act(policy.inputs(obs, np.array([clock])))
-                obs, _, _, ended, _ = env.step(np.asarray(actions))
-                clock = 0 if ended[0] else clock + 1
+                step, _, clock = acting.step(env, obs, clock, elapsed)
+                obs, elapsed = step.next_obs, elapsed + 1
+                if max(elapsed, clock[0]) >= self._horizon:
+                    obs, _ = env.reset()
+                    acting = self._acting()  # the same for a whole episode
+                    clock, elapsed = np.zeros(1, np.int32), 0
             if time.monotonic() - due > self._dt:
                 due = time.monotonic()
-            moment = self._moment(env, model, data, clock, policy is not None)
+            moment = self._moment(env.qpos[0], model, data, int(clock[0]), elapsed, acting is not None)
             for watcher in watchers:
                 try:
                     watcher(moment)
@@ -120,9 +130,10 @@ class Live:
             time.sleep(max(0.005, 1 / FRAMES_PER_SECOND - max(0.0, time.monotonic() - due)))
 
     def _moment(
-        self, env: Any, model: mujoco.MjModel, data: mujoco.MjData, clock: int, acting: bool
-    ) -> Moment:
-        data.qpos[:] = env.qpos[0]
+        self, qpos: np.ndarray, model: mujoco.MjModel, data: mujoco.MjData, clock: int, elapsed: int,
+        acting: bool,
+    ) -> Moment:  # fmt: skip
+        data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         x = float(data.subtree_com[0, 0])  # What the camera of the clips follows, too.
@@ -132,7 +143,8 @@ class Live:
             xpos=xpos,
             xmat=data.xmat.reshape(-1, 3, 3).copy(),
             x=x,
-            seconds=clock * self._dt,
+            demo_seconds=clock * self._dt,
+            seconds=elapsed * self._dt,
             acting=acting,
         )
 

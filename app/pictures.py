@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -19,17 +18,6 @@ from trainer.records import Demo
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640
 _CLIP_SECONDS = 0.3
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Example:
-    """Two moments of the demo side by side, and how far they are apart."""
-
-    webp: bytes
-    at: float
-    """Where the left side begins in the demo, seconds."""
-    other: float
-    """Where the right side begins, seconds."""
 
 
 class Pictures:
@@ -45,7 +33,7 @@ class Pictures:
         self._read = read
         self._lock = threading.Lock()
         self._frames: list[bytes] | None = None
-        self._examples: dict[str, Example] = {}
+        self._examples: dict[str, bytes] = {}
 
     def frames(self) -> list[bytes]:
         """Every frame of the demo as JPEG, in order."""
@@ -55,8 +43,8 @@ class Pictures:
             assert self._frames is not None
             return self._frames
 
-    def examples(self) -> dict[str, Example]:
-        """Examples "same", "near", "other" and "far": the demo beside itself at growing distance."""
+    def examples(self) -> dict[str, bytes]:
+        """Examples "same", "near", "other" and "far", as WebP: the demo beside itself at growing distance."""
         with self._lock:
             if self._frames is None:
                 self._prepare()
@@ -69,10 +57,9 @@ class Pictures:
         examples = {}
         for name, other in moments.items():
             start = moments["same"]
-            webp = compose_clip(
+            examples[name] = compose_clip(
                 frames[start : start + length], frames[other : other + length], fps=self.demo.fps
             )
-            examples[name] = Example(webp=webp, at=start / self.demo.fps, other=other / self.demo.fps)
         self._examples = examples
         self._frames = [_jpeg(frame) for frame in frames]
 

@@ -171,7 +171,7 @@ _SUBMIT = (
 def top_html(count: int, target: int, *, asking: bool) -> str:
     """The question, if there is something to rate, and how far the ratings have come."""
     share = min(1.0, count / target) if target else 0.0
-    question = "How similar is the attempt to the demonstration?" if asking else ""
+    question = "How alike are the two movements?" if asking else ""
     progress = f"<b>{count}</b> of {target}" if count < target else f"<b>{count}</b>, as many as asked for"
     return (
         f'<div class="od-rate-top"><h1>{question}</h1>'
@@ -187,7 +187,7 @@ def clip_html(clip: int, upcoming: int | None, problem: str) -> str:
     sides = "".join(
         f'<figure class="od-side od-{side}"><figcaption>{caption}</figcaption>'
         f'<div><img src="{source}" alt="{caption}" decoding="sync" draggable="false"></div></figure>'
-        for side, caption in (("left", "Demonstration"), ("right", "Attempt"))
+        for side, caption in (("left", "From the video"), ("right", "The robot"))
     )
     ahead = f'<img class="od-ahead" src="/clips/{upcoming}.webp" alt="">' if upcoming is not None else ""
     trouble = f'<p class="od-problem" role="alert">{escape(problem)}</p>' if problem else ""
@@ -214,9 +214,9 @@ def waiting_html(status: Status, count: int, problem: str) -> str:
         )
     else:
         wait = status.next_clips_s
-        when = f" New attempts in about {_seconds(wait)}." if wait is not None else ""
+        when = f" New pairs in about {_seconds(wait)}." if wait is not None else ""
         body = (
-            '<div class="od-mark od-busy" aria-hidden="true"></div><h2>No attempt to rate just now</h2>'
+            '<div class="od-mark od-busy" aria-hidden="true"></div><h2>Nothing to rate just now</h2>'
             f"<p>{escape(status.message)}{when}</p><p class=od-quiet>They will appear here by themselves.</p>"
         )
     return f'<div class="od-waiting" role="status">{body}{trouble}</div>'

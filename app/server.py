@@ -53,7 +53,7 @@ class Page:
         self.secret = secrets.token_urlsafe(32)
         self.pictures = pictures or Pictures(trainer.demo)
         self.assignment = Assignment()
-        self.live = Live(trainer.acting_policy, trainer.demo.seconds)
+        self.live = Live(trainer.acting, trainer.demo.seconds)
         self._raters: dict[int, Rater] = {}
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""
 _CONFIRM_SECONDS = 5.0
+_APART_SECONDS = 0.1
+"""If the demo is further from the robot's own time than this, both times are told."""
 # As in the clips, so that robot and demo have one scale; the mouse turns it.
 _CAMERA_POSITION = (0.0, -3.0, 1.02)
 _CAMERA_TARGET = (0.0, 0.0, 1.02)
@@ -53,6 +55,7 @@ class Watch:
         self._lock = threading.RLock()
         self._scene: ViserMujocoScene | None = None
         self._frame = -1
+        self._practised = False
         self._confirm_until = 0.0
         self._commands: list[Any] = []
         self._shown = False
@@ -66,7 +69,7 @@ class Watch:
         self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
         self._classes = gui.add_html("")
         self._put(self._picture, frame_html(0))
-        self._put(self._time, time_html(0, self._demo.seconds, True))
+        self._put(self._time, time_html(0, 0, self._demo.seconds, ""))
 
     def show(self) -> None:
         """Starts the live robot and the keys."""
@@ -93,6 +96,7 @@ class Watch:
         with self._lock:
             if not self._shown:
                 return
+            self._practised = status.iteration > 0
             self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until))
             self._charts.extend(self._trainer.store.iterations(self._trainer.run, after=self._charts.last))
             self._put(
@@ -157,11 +161,13 @@ class Watch:
         with self._client.atomic():
             scene.update_from_arrays(moment.xpos[None], moment.xmat[None])
             scene.fixed_bodies_frame.position = (-moment.x, 0.0, 0.0)
-            frame = min(int(moment.seconds * self._demo.fps), self._demo.frames - 1)
+            frame = min(int(moment.demo_seconds * self._demo.fps), self._demo.frames - 1)
             if frame // max(1, round(self._demo.fps / _DEMO_HZ)) != self._frame:
                 self._frame = frame // max(1, round(self._demo.fps / _DEMO_HZ))
                 self._put(self._picture, frame_html(frame))
-                self._put(self._time, time_html(moment.seconds, self._demo.seconds, moment.acting))
+                note = "" if moment.acting and self._practised else _UNPRACTISED
+                where = time_html(moment.demo_seconds, moment.seconds, self._demo.seconds, note)
+                self._put(self._time, where)
         self._client.flush()
 
     def _put(self, handle: Any, content: str) -> None:
@@ -170,6 +176,7 @@ class Watch:
             handle.content = content
 
 
+_UNPRACTISED = "The robot has not practised yet: it needs ratings first."
 _ROBOT = '<figure class="od-view od-robot"><figcaption>Robot, live</figcaption><div></div></figure>'
 
 
@@ -177,6 +184,7 @@ def strip_html(status: Status, confirming: bool) -> str:
     """What the trainer does, in figures, and its controls."""
     running = status.phase in ("starting", "pretrain", "online")
     figures = [
+        ("Method", escape(status.method) or "–", ""),
         ("Iteration", f"{status.iteration:,}", ""),
         ("Steps", f"{_short(status.env_steps)}", f"of {_short(status.total_steps)}"),
         ("Speed", f"{status.steps_per_s:,.0f}", "steps/s"),
@@ -206,13 +214,20 @@ def frame_html(frame: int) -> str:
     )
 
 
-def time_html(seconds: float, length: float, acting: bool) -> str:
-    """Where in the move both are."""
-    share = min(1.0, seconds / length) if length else 0.0
-    note = "" if acting else "The robot stands still: there is no policy yet."
+def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> str:
+    """How far along the demo the robot is.
+
+    Args:
+        demo_seconds: There, in the demo.
+        seconds: Since the robot began; said if the demo has not moved on as fast.
+        length: Of the demo, seconds.
+        note: One sentence below it.
+    """
+    share = min(1.0, demo_seconds / length) if length else 0.0
+    taken = f", after {seconds:.1f} s" if abs(seconds - demo_seconds) >= _APART_SECONDS else ""
     return (
         f'<div class="od-time"><i><i style="width:{100 * share:.1f}%"></i></i>'
-        f"<span>{seconds:.1f} s of {length:.1f} s</span><em>{note}</em></div>"
+        f"<span>Video at {demo_seconds:.1f} s of {length:.1f} s{taken}</span><em>{note}</em></div>"
     )
 
 

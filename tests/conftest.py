@@ -28,6 +28,12 @@ CHROMIUM_FLAGS = [
 
 
 @pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished runs of all tables, so that demo and robot are looked at once, and runs are shared."""
+    return tmp_path_factory.mktemp("results")
+
+
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
     names = ("chromium", "chromium-browser")
@@ -43,6 +49,19 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=path, args=CHROMIUM_FLAGS)
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="session")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
+    from trainer import appearance
+    from trainer.encoders import make_encoder
+
+    directory = tmp_path_factory.mktemp("looked") / "robots"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(appearance, "PICTURES", 300)
+        appearance.learn("hopper", make_encoder("efficientnet-lite0"), directory)
+    return directory
 
 
 @dataclass

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.records import Demo, Segment, Status
+from trainer.rollouts import Acting, EpisodeRules
 from trainer.store import NewClip, Store
 
 FPS = 30.0
@@ -32,13 +33,15 @@ def drawn_frames(count: int, phase: float = 0.0) -> np.ndarray:
     return frames
 
 
-class Acting:
-    """Holds still with a wobble."""
+class Wobble:
+    """A policy that holds still with a wobble."""
+
+    horizon = 1000
 
     def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
         return clock[:, None]
 
-    def act(self, inputs: np.ndarray) -> np.ndarray:
+    def act(self, inputs: np.ndarray, rng: object = None) -> np.ndarray:
         return 0.6 * np.sin(inputs / 20 + np.arange(3))
 
 
@@ -62,6 +65,7 @@ class StandIn:
         self._status = Status(
             phase="pretrain",
             message="The robot is waiting for your first ratings.",
+            method="onedemo",
             target_ratings=target,
             total_steps=2_000_000,
         )
@@ -97,8 +101,8 @@ class StandIn:
     def clip_file(self, clip_id: int) -> Path:
         return self.directory / f"{clip_id:06d}.webp"
 
-    def acting_policy(self):
-        return Acting()
+    def acting(self) -> Acting:
+        return Acting(policy=Wobble(), rules=EpisodeRules())  # type: ignore[arg-type]
 
     def pause(self) -> None:
         self.calls.append("pause")

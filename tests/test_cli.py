@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 import socket
 import sqlite3
 import subprocess
@@ -8,7 +9,8 @@ import sys
 import pytest
 from serving import Serving
 
-from app.cli import main
+from app.cli import _parser, main
+from trainer.config import METHODS
 from trainer.migrations import STEPS as SCHEMA
 from trainer.store import FILE_NAME, RATING_COLUMNS, Store
 
@@ -41,6 +43,7 @@ from trainer.store import FILE_NAME, RATING_COLUMNS, Store
         ("train --json /nowhere/out.json", "cannot write /nowhere/out.json"),
         ("serve --host a..b", "cannot be opened"),
         ("nonsense", "invalid choice: 'nonsense'"),
+        ("train --method papre", "--method: invalid choice: 'papre'"),
     ],
 )
 def test_bad_input_is_one_sentence_and_code_2(arguments, sentence, tmp_path, capsys):
@@ -98,8 +101,15 @@ def test_help_is_quick_and_loads_nothing_heavy():
     assert out.rstrip().endswith("[]")
 
 
+def test_every_method_can_be_asked_for():
+    for method in METHODS:
+        for command in ("serve", "train"):
+            assert _parser().parse_args([command, "--method", method]).method == method
+
+
 @pytest.mark.seam
-def test_the_headless_run_of_the_readme(tmp_path, capsys):
+def test_the_headless_run_of_the_readme(tmp_path, capsys, robots):
+    shutil.copytree(robots, tmp_path / "robots")
     out = tmp_path / "summary.json"
     words = "train --demo hopper-backflip --rater oracle --ratings 40 --steps 100000 --seed 0"
     assert main([*words.split(), "--data-dir", str(tmp_path), "--json", str(out)]) == 0

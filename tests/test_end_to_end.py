@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import sqlite3
 import time
 import urllib.request
@@ -32,7 +33,8 @@ QUICK = ["--port", "0", *(word for key, value in SETTINGS.items() for word in ("
 
 
 @pytest.fixture
-def serving(tmp_path):
+def serving(tmp_path, robots):
+    shutil.copytree(robots, tmp_path / "data" / "robots")
     serving = Serving(tmp_path / "data")
     yield serving
     serving.close()
@@ -88,8 +90,12 @@ def rate_five_and_look(chromium, serving, tmp_path, *options):
     return links, expected
 
 
-def test_five_ratings_by_key_button_and_slider(chromium, serving, tmp_path):
-    rate_five_and_look(chromium, serving, tmp_path)
+@pytest.mark.parametrize("method", ["onedemo", "paper"])
+def test_five_ratings_by_key_button_and_slider(chromium, serving, tmp_path, method):
+    links, _ = rate_five_and_look(chromium, serving, tmp_path, "--method", method)
+    with opened(chromium, links["researcher"], SMALL) as page:
+        page.click('.od-tabs >> text="Data"')
+        page.wait_for_selector(f".od-data >> text=method {method}")
 
 
 def test_the_same_with_a_real_person_as_the_demo(chromium, serving, tmp_path):

@@ -1,5 +1,6 @@
 import ast
 import os
+import re
 import sys
 import threading
 import time
@@ -11,10 +12,14 @@ import torch
 from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
 import trainer
+from trainer import envs
+from trainer.appearance import regress
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from trainer.loop import Simulated, Trainer
 from trainer.metric import MetricSnapshot
+from trainer.practice import PracticeRules
+from trainer.rollouts import EpisodeRules, evaluate
 from trainer.runs import add_run, find_run
 from trainer.store import Store
 
@@ -140,7 +145,7 @@ def test_people_rate_and_the_trainer_follows(store, demo):
     trainer_ = make_trainer(store, demo, config=small_config(rollouts__total_steps=10**6))
     trainer_.start()
     wait_for(lambda: trainer_.status().phase == "pretrain")
-    assert trainer_.acting_policy() is not None
+    assert trainer_.acting() is not None
     if sys.platform == "linux":  # people at the page come first
         (thread,) = [t for t in threading.enumerate() if t.name == "trainer"]
         assert os.getpriority(os.PRIO_PROCESS, thread.native_id) > os.getpriority(os.PRIO_PROCESS, 0)
@@ -193,6 +198,153 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
     wait_for(lambda: trainer_.status().iteration >= 1)
     assert trainer_.status().error == ""
     trainer_.stop()
+
+
+@pytest.fixture
+def few_wild(monkeypatch):
+    """Random states are drawn and tried in seconds."""
+    monkeypatch.setattr("trainer.learner._WILD_LANES", 4)
+    monkeypatch.setattr("trainer.practice._BANK_TRIES", 200)
+
+
+def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monkeypatch, few_wild):
+    ann = store.ensure_rater("Ann", "annotator")
+    looked = threading.Event()
+
+    def look(env, encoder, cache_dir, check):
+        while not looked.wait(0.05):
+            check()
+        rng = np.random.default_rng(0)
+        return regress(
+            rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
+        )
+
+    monkeypatch.setattr("trainer.loop.learn_appearance", look)
+    trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
+    trainer_.start()
+    for _ in range(3):
+        wait_for(lambda: store.waiting_clips("r", "cut"))
+        rate_all(store, "r", ann)
+    assert trainer_.status().phase == "starting" and trainer_.status().ratings >= 9
+    assert trainer_.acting() is None and not store.snapshots("r")
+    trainer_.stop(timeout_s=10)
+    assert trainer_.status().phase == "stopped"
+    trainer_.resume()
+    wait_for(lambda: trainer_.status().phase == "starting")
+    looked.set()
+    wait_for(lambda: trainer_.status().phase == "pretrain" and trainer_.acting() is not None)
+    trainer_.stop()
+
+
+def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
+    ann = store.ensure_rater("Ann", "annotator")
+    config = small_config(
+        method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
+    )
+    trainer_ = make_trainer(store, demo, config=config)
+    trainer_.start()
+    wait_for(lambda: trainer_.acting() is not None)
+    before = trainer_.acting()
+    assert before is not None and type(before.rules) is EpisodeRules  # nothing says what is alike
+
+    def rate_some():
+        for clip in store.waiting_clips("r", "cut"):
+            store.rate(clip.id, ann.id, by_rule(store.segment(clip.id), clip.demo_step), latency_ms=5)
+        return trainer_.status().iteration >= 2
+
+    wait_for(rate_some, seconds=60)
+    trainer_.stop()
+    one, two = trainer_.acting(), trainer_.acting()
+    assert one is not None and two is not None and one.rules is not two.rules
+    assert isinstance(one.rules, PracticeRules)
+    learner, snapshot = trainer_.final_policy()
+    np.testing.assert_array_equal(one.policy.weights[0], learner.policy().weights[0])
+    env = envs.make("hopper", 1, horizon=101, nthread=0)
+    obs, _ = env.reset(seed=5)
+    expected = evaluate(
+        learner.policy(), "hopper", episodes=1, seed=5, horizon=100,
+        rules=learner.rules(1, snapshot),
+    )  # fmt: skip
+    clock = np.zeros(1, np.int32)
+    for t in range(100):
+        step, _, clock = one.step(env, obs, clock, t)
+        obs = step.next_obs
+        assert clock[0] == expected.clock[0, t + 1]
+    env.close()
+    assert not np.array_equal(expected.clock[0], np.arange(101))  # it waits, or hurries
+
+
+def test_clips_for_people_are_chosen_a_few_at_a_time(store, demo):
+    ann = store.ensure_rater("Ann", "annotator")
+    trainer_ = make_trainer(store, demo, config=small_config(ratings__queue=12, ratings__pretrain=100))
+    trainer_.start()
+    wait_for(lambda: trainer_.status().phase == "pretrain" and len(store.waiting_clips("r", "cut")) == 12)
+    for clip in store.waiting_clips("r", "cut")[:3]:
+        store.rate(clip.id, ann.id, 3, latency_ms=5)
+    time.sleep(1.0)
+    assert len(store.waiting_clips("r", "cut")) == 9
+    store.rate(store.waiting_clips("r", "cut")[0].id, ann.id, 3, latency_ms=5)
+    wait_for(lambda: len(store.waiting_clips("r", "cut")) == 12)
+    trainer_.stop()
+
+
+def test_every_rating_asked_for_can_be_given(store, demo):
+    """However few are left: a queue that is filled a few at a time must not keep the last ones back."""
+    ann = store.ensure_rater("Ann", "annotator")
+    trainer_ = make_trainer(
+        store, demo, config=small_config(ratings__queue=12, ratings__pretrain=30, ratings__online=0)
+    )
+    trainer_.start()
+
+    def rate_one():
+        for clip in store.waiting_clips("r", "cut")[:1]:
+            store.rate(clip.id, ann.id, 3, latency_ms=5)
+        return trainer_.status().ratings == 30
+
+    wait_for(rate_one, seconds=60)
+    assert not store.waiting_clips("r", "cut")
+    trainer_.stop()
+
+
+def test_a_run_of_before_there_were_methods_goes_on(store, demo):
+    """Its config names no method, its snapshots hold one network, its checkpoint no rules."""
+    first: Trainer
+
+    def rate_and_stop(segment, demo_step):
+        if first.status().iteration >= 3:
+            first.stop()
+        return by_rule(segment, demo_step)
+
+    first = make_trainer(store, demo, Simulated(name="rule", rate=rate_and_stop))
+    first.work()
+    before = store.iterations("r")
+    directory = first.directory
+    as_of_before(directory)
+    found = find_run(store, store.path.parent, demo, name="r", wanted=None)
+    assert found is not None and found[1] == small_config()
+    second = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
+    assert second.status().method == "paper"
+    second.work()
+    after = store.iterations("r")
+    assert after[: len(before)] == before and [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
+
+
+def as_of_before(directory):
+    """Rewrites the files of a run as version 0.1 left them."""
+    new = ("method", "starts", "pairing", "choice", "rounds", "kind", "appearance", "members", "ordinal")
+    text = (directory / "config.toml").read_text()
+    text = re.sub(r"\[practice\]\n(.+\n)+", "", text)
+    lines = [line for line in text.splitlines() if line.split(" = ")[0] not in (*new, "final_kl")]
+    kind = lines.index("[policy]") + 1
+    (directory / "config.toml").write_text("\n".join([*lines[:kind], 'kind = "clock"', *lines[kind:]]) + "\n")
+    for file in (directory / "snapshots").iterdir():
+        data = torch.load(file, weights_only=True)
+        (data["net"],) = data.pop("nets")
+        data["config"] = {key: value for key, value in data["config"].items() if key not in new}
+        torch.save(data, file)
+    checkpoint = torch.load(directory / "checkpoint.pt", weights_only=True)
+    del checkpoint["learner"]["rules"]
+    torch.save(checkpoint, directory / "checkpoint.pt")
 
 
 def test_a_run_leaves_no_temporary_file(store, demo):

@@ -43,7 +43,7 @@ def view(rollouts):
     obs = rollouts.obs[0, :250][np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)]
     track = Track(pose=body.pose(obs).astype(np.float32), motion=body.motion(obs).astype(np.float32))
     visual = np.random.default_rng(0).normal(size=(FRAMES, 4)).astype(np.float32)
-    return View(visual=visual, track=track)
+    return View(visual=visual, track=track, basis=np.ones((len(visual), 1), np.float32), fps=30.0)
 
 
 def true_distance(view, frames, obs):

@@ -5,6 +5,10 @@ import numpy as np
 import pytest
 
 from trainer import envs, motion
+from trainer.demos import BUILT_IN
+from trainer.hidden import load_hidden
+
+DT = 0.008
 
 
 def test_net_turns():
@@ -44,6 +48,41 @@ def test_clean_turns_count_only_what_the_foot_carries():
     assert motion.clean_turns(touch) == 0
     np.testing.assert_array_equal(motion.clean_turns(np.stack([flying, rolling])), [1, 0])
     assert motion.clean_turns(path(-turn, high)) == -1
+
+
+def demo_positions(name):
+    return load_hidden(BUILT_IN / f"{name}.hidden.npz").qpos
+
+
+def test_landings_of_the_demos():
+    """The clean demo lands its three flips; the tumbling one never stands, the hop never turns."""
+    clean, tumbling, hop = map(demo_positions, ("hopper-flip-clean", "hopper-backflip", "hopper-hop"))
+    lanes = np.stack([clean, tumbling, hop])
+    np.testing.assert_array_equal(motion.landings(lanes, DT), [3, 0, 0])
+    np.testing.assert_array_equal(motion.net_turns(lanes[..., 2]), [3, 9, 0])
+
+
+def test_a_landing_is_on_the_foot_upright_and_lasts():
+    clean = demo_positions("hopper-flip-clean")
+    first = 300  # stands after its first flip
+    assert motion.landings(clean[:first], DT) == 1
+    over = int((clean[:, 2] <= motion.LANDED_LEAN - 2 * np.pi).argmax())
+    stay = round(motion.LANDED_FOR_S / DT)
+    assert motion.landings(clean[: over + stay - 1], DT) == 0, "too short to tell"
+    floating = clean[:first].copy()
+    floating[over:, 1] += 0.5
+    assert motion.landings(floating, DT) == 0, "the foot never touches the ground"
+    lying = clean[:first].copy()
+    lying[over:, 1] = 0.2
+    assert motion.landings(lying, DT) == 0
+    leaning = clean[:first].copy()
+    leaning[over:, 2] -= 1.0
+    assert motion.landings(leaning, DT) == 0
+    late = np.concatenate([clean[:over], np.repeat(floating[over : over + 1], 100, 0), clean[over:first]])
+    assert motion.landings(late, DT) == 0, "0.8 s in the air after the turn is over"
+    shift = clean[:first].copy()
+    shift[:, 2] = np.angle(np.exp(1j * shift[:, 2]))
+    assert motion.landings(shift, DT) == 1, "wrapped angles"
 
 
 def random_qpos(count, seed):

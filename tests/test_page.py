@@ -215,7 +215,7 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         store.set_clip_state([c.id for c in store.waiting_clips(site.trainer.run)], "withdrawn")
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
-        page.wait_for_selector("text=The robot is practising. New attempts in about 20 s.")
+        page.wait_for_selector("text=The robot is practising. New pairs in about 20 s.")
         (new,) = site.trainer.add_clips(1)
         assert shown_clip(page) == new
         site.trainer.set_status(target_ratings=3)
@@ -238,6 +238,11 @@ def test_researcher_sees_the_robot_move(chromium, site):
             times.add(page.locator(".od-demonstration img").get_attribute("src"))
             page.wait_for_timeout(250)
         assert len(times) > 1
+        assert page.locator(".od-figures div").first.inner_text().split() == ["Method", "onedemo"]
+        page.wait_for_selector(".od-time >> text=/Video at [0-9.]+ s of 8.0 s/")
+        page.wait_for_selector(".od-time >> text=has not practised yet")
+        site.trainer.set_status(iteration=1)
+        page.wait_for_selector(".od-time >> text=has not practised yet", state="detached")
         site.trainer.store.add_iteration(
             site.trainer.run, 1, snapshot=1, env_steps=16000, stats={"predicted": 1.5, "kl": 0.01}
         )

@@ -20,7 +20,9 @@ QUICK = paper(updates=400, visual_dims=8)
 @pytest.fixture(scope="module")
 def visual():
     features = np.random.default_rng(0).normal(size=(FRAMES, 40)).cumsum(axis=0)
-    return View(visual=visual_inputs(features, 8), track=None)
+    return View(
+        visual=visual_inputs(features, 8), track=None, basis=np.ones((FRAMES, 1), np.float32), fps=30.0
+    )
 
 
 def world(count, seed, skew=False):

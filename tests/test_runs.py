@@ -38,7 +38,7 @@ def test_the_newest_run_of_the_demo_goes_on_with_its_own_settings(store, tmp_pat
 
 def test_settings_that_contradict_the_run_are_refused(store, tmp_path):
     add_run(store, tmp_path, DEMO, load_config(), name=None)
-    with pytest.raises(UserError, match="other settings than those given"):
+    with pytest.raises(UserError, match="other settings than those given: seed is 0, not 1 "):
         find_run(store, tmp_path, DEMO, name=None, wanted=load_config(None, {"seed": 1}))
 
 
@@ -58,6 +58,74 @@ def test_settings_survive_the_loss_of_their_file(store, tmp_path):
     run = add_run(store, tmp_path, DEMO, settings, name=None)
     (tmp_path / "runs" / run / "config.toml").unlink()
     assert find_run(store, tmp_path, DEMO, name=run, wanted=None) == (run, settings)
+
+
+BEFORE = """seed = 3
+env = "hopper"
+device = "cpu"
+encoder = "efficientnet-lite0"
+
+[ratings]
+pretrain = 20
+online = 15
+clip_seconds = 0.3
+queue = 12
+stale_iterations = 10
+online_share = 0.5
+
+[rollouts]
+lanes = 64
+steps = 250
+total_steps = 10000000
+threads = 2
+physics = "mujoco"
+
+[predictor]
+sampling = "equal"
+class_weights = false
+additional_layer = true
+hidden = 64
+visual_dims = 24
+learning_rate = 0.03
+weight_decay = 0.0001
+batch_clips = 60
+pairs_per_clip = 4
+updates = 1500
+reward = "expected"
+
+[policy]
+kind = "clock"
+hidden = [64, 64]
+log_std = 0.0
+
+[trpo]
+max_kl = 0.02
+gamma = 0.99
+lam = 0.97
+cg_iterations = 10
+damping = 0.1
+backtracks = 10
+backtrack_factor = 0.8
+fisher_samples = 8192
+value_epochs = 5
+value_rate = 0.001
+value_batch = 2048
+entropy_bonus = 0.0
+"""
+"""What version 0.1 wrote."""
+
+
+def test_a_run_of_before_there_were_methods_is_the_papers(store, tmp_path):
+    run = add_run(store, tmp_path, DEMO, load_config(), name=None)
+    (tmp_path / "runs" / run / "config.toml").write_text(BEFORE)
+    found = find_run(store, tmp_path, DEMO, name=run, wanted=None)
+    assert found is not None
+    config = found[1]
+    settings = {"seed": 3, "ratings.pretrain": 20, "ratings.online": 15, "trpo.max_kl": 0.02}
+    # The trust region stayed what it was.
+    assert config == load_config(None, settings | {"method": "paper", "trpo.final_kl": 0.02})
+    with pytest.raises(UserError, match="method is 'paper', not 'onedemo'"):
+        find_run(store, tmp_path, DEMO, name=run, wanted=load_config(None, settings))
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "", "x" * 65, "a b"])

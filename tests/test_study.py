@@ -106,6 +106,16 @@ def test_finished_runs_are_not_run_again(tmp_path):
 
 
 @pytest.mark.seam
+def test_jobs_share_a_cache_if_they_ask_for_one(tmp_path):
+    jobs = [job(seed, kind="tiny:remembers") for seed in (0, 1)]
+    run_jobs(jobs[:1], tmp_path)
+    second = run_jobs(jobs, tmp_path)[1]
+    assert second.result == {"there": ["0", "1"]}
+    assert (tmp_path / "cache" / "1").exists()
+    assert "cache" not in second.kept
+
+
+@pytest.mark.seam
 def test_a_run_that_fails_or_dies_is_told_and_not_kept(tmp_path):
     jobs = [job(1, kind="tiny:falls"), job(0, kind="tiny:dies"), job(2, kind="tiny:falls")]
     told = []

@@ -14,7 +14,7 @@ import hashlib
 import io
 import logging
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,13 +103,18 @@ class Appearance:
         return Track(pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32))
 
 
-def learn(env_name: str, encoder: Encoder, cache_dir: Path) -> Appearance:
+def _go_on() -> None:
+    """Lets everything run to its end."""
+
+
+def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on) -> Appearance:
     """Learns what the robot looks like, or takes what was learned before.
 
     Args:
         env_name: The robot.
         encoder: Looks at the pictures.
         cache_dir: Where it is kept, by robot and encoder.
+        check: Called every now and then; what it raises ends the learning.
 
     Raises:
         UserError: If this machine cannot draw.
@@ -123,14 +128,16 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path) -> Appearance:
                 return Appearance(stored)
         except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
             _log.warning("%s is damaged (%s): made anew", path, error)
-    appearance = regress(*pictures(env_name, encoder, PICTURES))
+    appearance = regress(*pictures(env_name, encoder, PICTURES, check), check)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)
     write_atomic(path, buffer.getvalue())
     return appearance
 
 
-def pictures(env_name: str, encoder: Encoder, count: int) -> tuple[np.ndarray, np.ndarray]:
+def pictures(
+    env_name: str, encoder: Encoder, count: int, check: Callable[[], None] = _go_on
+) -> tuple[np.ndarray, np.ndarray]:
     """Draws and encodes what random actions do from random and from standing starts.
 
     States that physics has run on for a while look like those of a demo: parts rest on the ground,
@@ -147,11 +154,17 @@ def pictures(env_name: str, encoder: Encoder, count: int) -> tuple[np.ndarray, n
     qpos = rollouts.qpos[:, ::every].reshape(-1, rollouts.qpos.shape[-1])
     qpos = np.random.default_rng(_SEED).permutation(qpos)[:count]
     with RenderThread() as drawing:  # a thread of its own: those of the encoder take turns at asking
-        features = encoder.encode(drawing.render(q[None]).result()[0] for q in qpos)
+
+        def drawn() -> Iterator[np.ndarray]:
+            for q in qpos:
+                check()
+                yield drawing.render(q[None]).result()[0]
+
+        features = encoder.encode(drawn())
     return features, body.pose(qpos[:, 1:]).astype(np.float32)
 
 
-def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
+def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> Appearance:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
 
     One thread computes: several would add up in another order, and runs with another number of
@@ -160,16 +173,17 @@ def regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
     Args:
         features: (n, D).
         poses: (n, P).
+        check: Called before each pass over the pictures; what it raises ends the fit.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _regress(features, poses)
+        return _regress(features, poses, check)
     finally:
         torch.set_num_threads(threads)
 
 
-def _regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
+def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None]) -> Appearance:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
     inputs, targets = torch.from_numpy((features - mean) / std), torch.from_numpy(poses)
@@ -182,6 +196,7 @@ def _regress(features: np.ndarray, poses: np.ndarray) -> Appearance:
         optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-2, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
         for _ in range(_EPOCHS):
+            check()
             for index in torch.randperm(train, generator=generator).split(_BATCH):
                 seen = inputs[index]
                 # Features that are missing or off must not matter: dropout and noise of our own generator.

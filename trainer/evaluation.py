@@ -1,21 +1,43 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
 Evaluation may read hidden demo states; nothing in ``trainer.learner`` or ``trainer.loop`` may.
+
+Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from trainer import envs
+from trainer.alignment import align
 from trainer.learner import Learner
-from trainer.motion import backflip_reward, clean_turns, net_turns
+from trainer.motion import (
+    backflip_reward,
+    clean_turns,
+    farthest_turn,
+    hop_reward,
+    landings,
+    net_turns,
+    turned,
+    until_fall,
+)
+from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
-from trainer.raters import Oracle
-from trainer.rollouts import Episodes, evaluate
+from trainer.raters import Oracle, appearance
+from trainer.rollouts import EpisodeRules, Episodes, evaluate
 
 EPISODES = 16
+ALIGN_SECONDS = 0.6
+"""How late or early the robot may be when it is laid along the demo; as far as an elastic clock goes by
+default (``practice.slack_seconds``), but the same for every method."""
+LEAST_IS_BEST = ("state_error",)
+"""Figures whose best episode has the least."""
+
 _SEED = 10_000
 """Of the start states: the same for every policy, and used by no training."""
+_EVERY = 4
+"""Control steps between the moments that are aligned: about a frame."""
 
 
 def summarise(
@@ -26,34 +48,141 @@ def summarise(
     Args:
         learner: Holds the policy.
         snapshot: Predicts similarity; None leaves that figure out.
-        oracle: Knows the demo's hidden states; None leaves the true similarity out.
+        oracle: Knows the demo's hidden states; None leaves out what compares with them.
 
     Returns:
-        ``predicted_similarity`` and ``true_similarity`` (mean rating of a step, 1..5),
-        ``backflip_reward`` (actions clipped to what the motors do), ``backflip_reward_raw_actions``,
-        ``net_turns`` and ``clean_turns``; None where a figure cannot be had.
+        ``predicted_similarity`` (mean rating of a step, 1..5) and all of ``per_episode``; None where a
+        figure cannot be had.
     """
-    episodes = evaluate(
-        learner.policy(), learner.config.env, episodes=EPISODES, seed=_SEED,
-        rules=learner.rules(EPISODES, snapshot) if snapshot is not None else None,
-    )  # fmt: skip
-    return {
-        "predicted_similarity": _spread(_predicted(learner, snapshot, episodes)),
-        "true_similarity": _spread(_true(oracle, episodes)),
-        "backflip_reward": _spread(backflip_reward(episodes.obs[:, 1:], episodes.actions).sum(axis=-1)),
-        "backflip_reward_raw_actions": _spread(
-            backflip_reward(episodes.obs[:, 1:], episodes.actions, clip_actions=False).sum(axis=-1)
-        ),
-        "net_turns": _spread(net_turns(episodes.qpos[..., 2])),
-        "clean_turns": _spread(clean_turns(episodes.qpos)),
-    }
+    episodes = perform(learner, snapshot)
+    figures = {"predicted_similarity": predicted_similarity(learner, snapshot, episodes)}
+    return {name: spread(name, values) for name, values in (figures | per_episode(episodes, oracle)).items()}
 
 
-def _predicted(learner: Learner, snapshot: Snapshot | None, episodes: Episodes) -> np.ndarray | None:
+def perform(learner: Learner, snapshot: Snapshot | None) -> Episodes:
+    """The 16 episodes of the current policy; the snapshot moves an elastic clock."""
+    rules = learner.rules(EPISODES, snapshot) if snapshot is not None else None
+    return perform_policy(learner.policy(), env_name=learner.config.env, rules=rules)
+
+
+def perform_policy(
+    policy: PolicySnapshot, *, env_name: str = "hopper", rules: EpisodeRules | None = None
+) -> Episodes:
+    """The 16 episodes of any policy, from the same starts for all of them."""
+    return evaluate(policy, env_name, episodes=EPISODES, seed=_SEED, rules=rules)
+
+
+def predicted_similarity(
+    learner: Learner, snapshot: Snapshot | None, episodes: Episodes
+) -> np.ndarray | None:
+    """Mean predicted rating of the steps of each episode, by its own clock, (N,)."""
     if snapshot is None:
         return None
     frames = learner.frames_of(episodes.clock[:, :-1])
     return snapshot.ratings(frames, episodes.obs[:, :-1], episodes.actions).mean(axis=-1)
+
+
+def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarray | None]:
+    """What each episode was worth.
+
+    Args:
+        episodes: N of them.
+        oracle: Knows the demo's hidden states; None leaves out what compares with them.
+
+    Returns:
+        Of each episode, (N,):
+
+        - ``true_similarity``: mean rating of its states against the demo's at the same time, 1..5.
+        - ``aligned_similarity``: the same once it is laid along the demo (``aligned_similarity``).
+        - ``state_error``: mean squared error of its states (``state_errors``), mean over time.
+        - ``backflip_reward``, with the actions clipped to what the motors do, and
+          ``backflip_reward_raw_actions``.
+        - ``net_turns``, ``clean_turns``, ``landings``: see ``trainer.motion``.
+        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``trainer.motion``.
+        - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
+        - ``hop_reward``: the same rewards over the whole episode, falls or not.
+        - ``upright_seconds``: until then.
+    """
+    qpos, qvel, actions = episodes.qpos, episodes.qvel, episodes.actions
+    dt = envs.spec("hopper").dt
+    upright = until_fall(qpos[:, 1:], qvel[:, 1:])
+    hops = hop_reward(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:], actions)
+    return {
+        "true_similarity": _true(oracle, episodes),
+        "aligned_similarity": None if oracle is None else aligned_similarity(qpos, qvel, oracle),
+        "state_error": None if oracle is None else state_errors(episodes.obs, oracle.hidden.obs).mean(-1),
+        "backflip_reward": backflip_reward(episodes.obs[:, 1:], actions).sum(axis=-1),
+        "backflip_reward_raw_actions": backflip_reward(episodes.obs[:, 1:], actions, clip_actions=False).sum(
+            axis=-1
+        ),
+        "net_turns": net_turns(qpos[..., 2]),
+        "clean_turns": clean_turns(qpos),
+        "landings": landings(qpos, dt),
+        "turned": turned(qpos[..., 2]),
+        "farthest_turn": farthest_turn(qpos[..., 2]),
+        "hop_reward": hops.sum(axis=-1),
+        "hop_return": (hops * upright).sum(axis=-1),
+        "upright_seconds": upright.sum(axis=-1) * dt,
+    }
+
+
+def spread(name: str, values: np.ndarray | None) -> dict[str, float] | None:
+    """A figure of several episodes as {mean, best, worst}; None stays None."""
+    if values is None:
+        return None
+    best, worst = (np.min, np.max) if name in LEAST_IS_BEST else (np.max, np.min)
+    return {
+        "mean": round(float(np.mean(values)), 4),
+        "best": round(float(best(values)), 4),
+        "worst": round(float(worst(values)), 4),
+    }
+
+
+def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np.ndarray:
+    """How like the demo episodes are if being early or late does not count, up to ``ALIGN_SECONDS``.
+
+    Each episode is laid along the demo by dynamic time warping on the oracle's distance
+    (``trainer.alignment``); then every moment of the demo is rated against the episode's moment beside it.
+
+    Args:
+        qpos: Positions, (N, T, q).
+        qvel: Velocities, (N, T, v).
+        oracle: Knows the demo.
+
+    Returns:
+        Mean rating, 1..5, (N,).
+    """
+    every = slice(None, None, _EVERY)
+    demo = appearance(oracle.hidden.qpos[every], oracle.hidden.qvel[every])
+    robot = appearance(qpos[:, every], qvel[:, every])
+    distances = np.stack([np.linalg.norm(demo[:, None] - episode, axis=-1) for episode in robot])
+    band = round(ALIGN_SECONDS / (_EVERY * envs.spec("hopper").dt))
+    path = align(distances, band)
+    return oracle.rating_of(np.take_along_axis(distances, path[..., None], axis=-1)[..., 0]).mean(axis=-1)
+
+
+def state_errors(obs: np.ndarray, demo_obs: np.ndarray) -> np.ndarray:
+    """Squared error of the states against the demo's at the same time: the paper's figure 3 (c).
+
+    A state is the observation with the torso's angle as in a picture, by sine and cosine: a turn more or
+    less cannot be seen. Each of the 12 numbers is divided by its standard deviation over the demo; the
+    error is the mean over them, so the demo's own mean state has an error of 1 on average.
+
+    Args:
+        obs: Observations, (N, T, o).
+        demo_obs: The demo's, (T', o).
+
+    Returns:
+        (N, min(T, T')).
+    """
+    steps = min(obs.shape[1], len(demo_obs))
+    demo = _seen(demo_obs)
+    return np.square((_seen(obs[:, :steps]) - demo[:steps]) / demo.std(axis=0)).mean(axis=-1)
+
+
+def _seen(obs: np.ndarray) -> np.ndarray:
+    angle = obs[..., 1:2]
+    return np.concatenate([obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]], axis=-1)
 
 
 def _true(oracle: Oracle | None, episodes: Episodes) -> np.ndarray | None:
@@ -61,13 +190,3 @@ def _true(oracle: Oracle | None, episodes: Episodes) -> np.ndarray | None:
         return None
     lanes = zip(episodes.qpos[:, :-1], episodes.qvel[:, :-1], strict=True)
     return np.array([oracle.true_similarity(qpos, qvel) for qpos, qvel in lanes])
-
-
-def _spread(values: np.ndarray | None) -> dict[str, float] | None:
-    if values is None:
-        return None
-    return {
-        "mean": round(float(np.mean(values)), 4),
-        "best": round(float(np.max(values)), 4),
-        "worst": round(float(np.min(values)), 4),
-    }

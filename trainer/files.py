@@ -55,16 +55,20 @@ def check_writable(file: Path) -> None:
 
 
 @contextmanager
-def hold(path: Path) -> Iterator[None]:
+def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Holds a lock file: one process at a time, released when it ends, however it ends.
 
+    Args:
+        path: The file; made if missing, and left there.
+        wait: For another process to let go of it.
+
     Raises:
-        UserError: If another process holds it.
+        UserError: If another process holds it, and this one does not wait.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             raise UserError(
                 f"another onedemo is working on {path.parent}; stop it, or choose another --run or --data-dir"

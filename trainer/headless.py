@@ -36,6 +36,7 @@ def train(
     progress: bool = True,
     cache_dir: Path | None = None,
     watch: Callable[[Learner, Snapshot], None] | None = None,
+    start: Path | None = None,
 ) -> dict[str, Any]:
     """Trains with a simulated rater from the first rating to the last step.
 
@@ -50,6 +51,7 @@ def train(
         progress: Show a progress bar on standard error.
         cache_dir: Holds what is known of demos and robots; the data directory if None.
         watch: Called with learner and snapshot after each iteration, for a learning curve.
+        start: Snapshot of another run that the predictor starts from, see ``trainer.transfer``.
 
     Returns:
         The summary, ready for JSON: ratings, figures over 16 episodes of the final policy, costs.
@@ -68,6 +70,7 @@ def train(
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate), cache_dir=cache_dir, watch=watch,
+        start=start,
     )  # fmt: skip
     try:
         with hold(trainer.directory / "lock"):

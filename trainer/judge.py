@@ -105,6 +105,6 @@ class Judge(Budget):
     def close(self) -> None:
         """Holds nothing that would have to be freed."""
 
-    def _rating(self, distance: np.ndarray) -> np.ndarray:
-        """Ratings of distances without any error, the same shape."""
+    def rating_of(self, distance: np.ndarray) -> np.ndarray:
+        """Ratings of distances without any error, the same shape. Costs nothing: for evaluation."""
         return 5 - (np.asarray(distance)[..., None] > self._thresholds).sum(axis=-1)

@@ -19,9 +19,10 @@ from trainer.appearance import Track
 from trainer.choice import Question, choose
 from trainer.config import RunConfig
 from trainer.errors import UserError
+from trainer.imagined import track_basis
 from trainer.policy import Policy, PolicySnapshot, check_device
 from trainer.practice import PracticeRules, fill_bank
-from trainer.predictor import FitStats, Snapshot, View, fit, visual_inputs
+from trainer.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from trainer.records import Segment
 from trainer.rollouts import Collector, EpisodeRules, Transitions
 from trainer.starts import wild_rollouts
@@ -50,12 +51,14 @@ class Learner:
         config: The run's settings.
         frames: How many frames the demo has, F.
         fps: Frames per second of the demo.
+        start: A predictor of another move: each fit starts from it, and before the first one it
+            chooses what is asked. Practice waits for ratings all the same. None: from scratch.
 
     Raises:
         UserError: If the demo is shorter than a clip, or the device cannot be used.
     """
 
-    def __init__(self, config: RunConfig, frames: int, fps: float) -> None:
+    def __init__(self, config: RunConfig, frames: int, fps: float, start: Snapshot | None = None) -> None:
         spec = envs.spec(config.env)
         check_device(config.device)
         self.config = config
@@ -64,6 +67,9 @@ class Learner:
         self.iteration = 0
         self.env_steps = 0
         self._view: View | None = None
+        self._start = start
+        self._first: Snapshot | None = None  # the start beside this demo
+        self._fps = fps
         self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
         self._policy = self._make_policy().to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
@@ -81,8 +87,21 @@ class Learner:
         Args:
             features: Features of its frames, (F, D).
             track: What the frames show of the robot; None if that is not known.
+
+        Raises:
+            UserError: If the predictor to start from is of another kind, or was fitted with another encoder.
         """
-        self._view = View(visual=visual_inputs(features, self.config.predictor.visual_dims), track=track)
+        lens = self._lens(features)
+        self._view = View(
+            visual=lens.see(features),
+            track=track,
+            basis=track_basis(features, self._fps),
+            fps=self._fps,
+            lens=lens,
+        )
+        if self._start is not None:
+            check_start(self._start, self.config.predictor)
+            self._first = self._start.beside(self._view)
         if self.config.policy.kind == "table":
             if track is not None:
                 shown = np.concatenate([track.pose, track.motion], axis=-1)
@@ -127,6 +146,7 @@ class Learner:
             number=number,
             seed=self.config.seed,
             device=self.config.device,
+            start=self._start,
         )
 
     def choose(
@@ -134,6 +154,7 @@ class Learner:
     ) -> list[Question]:
         """Chooses clips of rollouts to be rated, by the run's settings (``trainer/choice.py``)."""
         config = self.config.ratings
+        snapshot = snapshot or self._first
 
         def judge(
             lanes: np.ndarray, starts: np.ndarray, demo_steps: np.ndarray
@@ -231,6 +252,18 @@ class Learner:
             bank = fill_bank(snapshot, self._wild_rollouts(), self.frames_of, self.demo_steps, rng)
         rules.use(snapshot, bank)
         self._banked = snapshot.number
+
+    def _lens(self, features: np.ndarray) -> Lens:
+        """The start's own, so that its weights mean the same; else one for this demo."""
+        lens = self._start.lens if self._start is not None else None
+        if lens is None:
+            return fit_lens(features, self.config.predictor.visual_dims)
+        if len(lens.mean) != features.shape[-1]:
+            raise UserError(
+                f"the predictor to start from was fitted on {len(lens.mean)} features of a frame, encoder "
+                f"{self.config.encoder} gives {features.shape[-1]}; use the encoder of that run"
+            )
+        return lens
 
     def _wild_rollouts(self) -> Transitions:
         if self._wild is None:

@@ -13,12 +13,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from trainer.appearance import Track
 from trainer.appearance import learn as learn_appearance
 from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
@@ -33,9 +35,10 @@ from trainer.predictor import Snapshot
 from trainer.priority import give_way
 from trainer.records import Clip, Demo, Segment, Status
 from trainer.render import RenderThread
-from trainer.rollouts import Transitions
+from trainer.rollouts import Acting, EpisodeRules, Transitions
 from trainer.store import NewClip, Store
 from trainer.training_set import TrainingSet
+from trainer.transfer import keep_start, snapshot_file
 
 log = logging.getLogger("onedemo")
 
@@ -43,6 +46,8 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
+_FULL = 2 / 3
+"""Share of the queue that waits before it is filled up for people."""
 _MOST_DECLINED = 100
 """After so many declined clips in a row, a simulated rater is asked again when there are new rollouts."""
 
@@ -55,6 +60,10 @@ class Simulated:
     """In the store."""
     rate: Callable[[Segment, int], int | None]
     """(segment, demo step) to a rating, 1..5, or None: declined, another clip is asked instead."""
+
+
+class _Stopped(Exception):
+    """The thread was told to end before it could begin."""
 
 
 class Trainer:
@@ -71,6 +80,8 @@ class Trainer:
         simulated: Answers in place of people; None for people.
         cache_dir: Holds what is known of demos and robots for any run; the data directory if None.
         watch: Called in the trainer's thread after each iteration.
+        start: Snapshot of another run that this one's predictor starts from; a copy is kept, so a run
+            that goes on needs none.
     """
 
     def __init__(
@@ -86,11 +97,12 @@ class Trainer:
         simulated: Simulated | None = None,
         cache_dir: Path | None = None,
         watch: Callable[[Learner, Snapshot], None] | None = None,
+        start: Path | None = None,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
         self.cache_dir = cache_dir or data_dir
-        self._watch = watch
+        self._watch, self._start = watch, start
         self.directory = data_dir / "runs" / run
         self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
         self._learner: Learner | None = None
@@ -108,7 +120,8 @@ class Trainer:
         self._work_began = self._work_s = 0.0
         self._status = Status(
             phase="starting",
-            message="Looking at the demonstration for the first time.",
+            message="Looking at the video for the first time.",
+            method=config.method,
             total_steps=config.rollouts.total_steps,
             pretrain_ratings=config.ratings.pretrain,
             target_ratings=config.ratings.pretrain + config.ratings.online,
@@ -157,9 +170,16 @@ class Trainer:
         """The animated picture of a clip; it is there once the clip is "ready"."""
         return self.directory / "clips" / f"{clip_id:06d}.webp"
 
-    def acting_policy(self) -> PolicySnapshot | None:
-        """The current policy, safe to use in any thread; None until there is one."""
-        return self._policy
+    def acting(self) -> Acting | None:
+        """The newest policy beside the demo as the newest snapshot moves it; None until there is a policy.
+
+        Any thread may ask. What it gets is its own and does not change: ask again for each episode.
+        """
+        learner, policy, snapshot = self._learner, self._policy, self._snapshot
+        if learner is None or policy is None:
+            return None
+        rules = learner.rules(1, snapshot) if snapshot is not None else EpisodeRules()
+        return Acting(policy=policy, rules=rules)
 
     # The thread
 
@@ -173,6 +193,8 @@ class Trainer:
             try:
                 self._work()
                 return
+            except _Stopped:
+                self._tell_stopped()
             except Exception as error:
                 if self._simulated is not None:
                     raise
@@ -190,7 +212,7 @@ class Trainer:
         while not self._stop.is_set():
             self._ask(learner)
             if learner.env_steps >= limit:
-                self._tell("done", "The agent has practised as long as it was told to.")
+                self._tell("done", "The robot has practised as long as it was told to.")
                 if self._simulated is not None:
                     return
                 self._stop.wait(_TICK_S)
@@ -198,24 +220,30 @@ class Trainer:
                 self._tell("paused", "Practice is paused. Ratings still count.")
                 self._stop.wait(_TICK_S)
             elif learner.iteration == 0 and self._ratings() < self.config.ratings.pretrain:
-                self._tell("pretrain", "The robot moves at random until it has learned from your ratings.")
+                self._tell(
+                    "pretrain",
+                    "So far the robot moves at random. It practises once it has learned from "
+                    f"{self.config.ratings.pretrain} ratings.",
+                )
                 self._work_began = time.monotonic()
                 if self._refit(learner, at_least=_PRETRAIN_REFIT if self._simulated is None else 1):
                     self._work_s = time.monotonic() - self._work_began
                 self._stop.wait(_TICK_S)
             else:
                 self._iterate(learner)
-        self._tell("stopped", "The run is stopped. It can be started again where it was.")
+        self._tell_stopped()
 
     def _prepare(self) -> Learner:
         # The networks that learn are too small to be split: threads would wait for each other more than
         # they compute, the longer the busier the machine. Their first weights depend on the number, too.
         torch.set_num_threads(1)
-        learner = Learner(self.config, self.demo.frames, self.demo.fps)
+        begun = bool(self.store.snapshots(self.run))
+        start = keep_start(self.directory, self._start, begun=begun)
+        first = Snapshot.load(start, self.config.device) if start is not None else None
+        learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
         self._learner = learner
-        self._policy = learner.policy()
         self._load_snapshot()
         if self._renderer is not None:
             self._clips = ClipMaker(
@@ -227,18 +255,34 @@ class Trainer:
                 renderer=self._renderer,
             )
             self._clips.recover(self.run)
-        if self._simulated is None:
-            self._ask(learner)  # people rate while the encoder looks at the demo, seconds the first time
+        with ThreadPoolExecutor(1, "look") as beside:
+            looking = beside.submit(self._look)
+            while not looking.done():
+                if self._simulated is None:
+                    self._ask(learner)  # people rate meanwhile
+                wait([looking], _TICK_S)
+        torch.set_num_threads(1)
+        learner.look_at(*looking.result())
+        self._policy = learner.policy()
+        return learner
+
+    def _look(self) -> tuple[np.ndarray, Track | None]:
+        """Looks at the demo, and at the robot if asked for: a minute or more the first time.
+
+        Returns:
+            Features of the demo's frames, (F, D), and what they show of the robot, if that can be told.
+        """
         torch.set_num_threads(self.config.rollouts.threads)
         features = demo_features(self.demo, self._encoder, self.cache_dir / "demos")
-        look = None
-        if self.config.predictor.appearance:
-            self._tell("starting", "Looking at pictures of the robot, once: about a minute.")
-            look = learn_appearance(self.config.env, self._encoder, self.cache_dir / "robots")
-        torch.set_num_threads(1)
-        track = look.track(features, self.demo.fps) if look is not None and look.knows(features) else None
-        learner.look_at(features, track)
-        return learner
+        if not self.config.predictor.appearance:
+            return features, None
+        self._tell("starting", "Looking at pictures of the robot: about a minute, the first time only.")
+        look = learn_appearance(self.config.env, self._encoder, self.cache_dir / "robots", self._check)
+        return features, look.track(features, self.demo.fps) if look.knows(features) else None
+
+    def _check(self) -> None:
+        if self._stop.is_set():
+            raise _Stopped
 
     def _iterate(self, learner: Learner) -> None:
         began = self._work_began = time.monotonic()
@@ -272,7 +316,7 @@ class Trainer:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
-        snapshot.save(self._snapshot_file(number))
+        snapshot.save(snapshot_file(self.directory, number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
         waiting = self.store.waiting_clips(self.run)
@@ -299,7 +343,8 @@ class Trainer:
     def _ask_missing(self, learner: Learner) -> bool:
         """Cuts as many clips as are missing from the queue, from the newest rollouts; True if some still are.
 
-        While the first iteration runs people go on with the random policy, so that nobody waits.
+        A few at a time, because one alone cannot be a mix of kinds (``trainer/choice.py``). While the
+        first iteration runs people go on with random motion, so that nobody waits.
         """
         if self._clips is not None:
             self._clips.retry()
@@ -312,7 +357,7 @@ class Trainer:
             missing = self._due(learner) - given
         elif given < self._status.target_ratings:
             queue = min(self.config.ratings.queue, self._status.target_ratings - given)
-            missing = queue - len(waiting)
+            missing = queue - len(waiting) if len(waiting) <= _FULL * queue else 0
         if missing <= 0:
             return False
         # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
@@ -397,6 +442,9 @@ class Trainer:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")
 
+    def _tell_stopped(self) -> None:
+        self._tell("stopped", "The run is stopped. It can be started again where it was.")
+
     def _tell(self, phase: str, message: str, stats: dict | None = None) -> None:
         learner = self._learner
         self._status = replace(
@@ -411,13 +459,10 @@ class Trainer:
 
     # Files
 
-    def _snapshot_file(self, number: int) -> Path:
-        return self.directory / "snapshots" / f"{number:06d}.pt"
-
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds."""
         for row in reversed(self.store.snapshots(self.run)):
-            file = self._snapshot_file(row["number"])
+            file = snapshot_file(self.directory, row["number"])
             if file.exists():
                 self._snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]

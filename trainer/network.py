@@ -19,7 +19,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from trainer.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from trainer.errors import UserError
+from trainer.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
 from trainer.store import RatedSegment
 
 STANDARD_DIMS = 15
@@ -27,6 +28,9 @@ _JUDGED_CLIPS = 2000
 """Clips behind ``FitStats.accuracy``, at most: a refit must not grow with the ratings."""
 _BOOTSTRAP = 0.85
 """Share of the clips that each of several members sees."""
+_TUNED = 0.3
+"""Share of the learning rate with which a network from another move is fine-tuned: its ratings are many
+more than the new ones, so what it knows should not be thrown about."""
 _ORDINAL_FALL = 1.5
 """Nats by which a rating is less right than the one next to it that is nearer to the one given."""
 
@@ -97,39 +101,47 @@ class NetworkSnapshot(Snapshot):
         visual: Visual inputs of the demo's frames, (F, V).
         mean: Mean of the standard inputs they were fitted on, (S,).
         std: Their standard deviation, (S,).
+        lens: How the visual inputs were made; None if that is not known.
     """
 
     def __init__(
         self, *, number: int, config: PredictorConfig, nets: Sequence[SimilarityNet], visual: np.ndarray,
-        mean: np.ndarray, std: np.ndarray,
+        mean: np.ndarray, std: np.ndarray, lens: Lens | None,
     ) -> None:  # fmt: skip
         super().__init__(number=number, config=config)
-        self._nets = [net.eval().requires_grad_(False) for net in nets]
+        self.nets = [net.eval().requires_grad_(False) for net in nets]
+        self.mean, self.std = mean, std
+        self.lens = lens
         self._visual = visual
-        self._mean, self._std = mean, std
         self._device = nets[0].fuse_visual.weight.device
         seen = torch.from_numpy(visual).to(self._device)
-        self._folded = [net.fuse_visual(seen) for net in self._nets]
+        self._folded = [net.fuse_visual(seen) for net in self.nets]
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As ``Snapshot.member_probabilities``."""
-        inputs = torch.from_numpy((standard_inputs(obs, actions) - self._mean) / self._std).to(self._device)
+        inputs = torch.from_numpy((standard_inputs(obs, actions) - self.mean) / self.std).to(self._device)
         index = torch.from_numpy(np.ascontiguousarray(frames).astype(np.int64)).to(self._device)
         with torch.inference_mode():
             members = []
-            for net, folded in zip(self._nets, self._folded, strict=True):
+            for net, folded in zip(self.nets, self._folded, strict=True):
                 fused = net.fuse_standard(net.standard(inputs)) + folded[index]
                 members.append(functional.softmax(net.head(fused), dim=-1).cpu().numpy())
         return np.stack(members)
 
+    def beside(self, view: View) -> NetworkSnapshot:
+        """As ``Snapshot.beside``; the view is through this snapshot's lens."""
+        return NetworkSnapshot(
+            number=0, config=self.config, nets=self.nets, visual=view.visual, mean=self.mean, std=self.std,
+            lens=self.lens,
+        )  # fmt: skip
+
     def tensors(self) -> dict[str, Any]:
-        """Weights and scales."""
-        return {
-            "nets": [{name: x.cpu() for name, x in net.state_dict().items()} for net in self._nets],
-            "visual": torch.from_numpy(self._visual),
-            "mean": torch.from_numpy(self._mean),
-            "std": torch.from_numpy(self._std),
-        }
+        """Weights, scales and lens."""
+        arrays = {"visual": self._visual, "mean": self.mean, "std": self.std}
+        if self.lens is not None:
+            arrays |= {"lens_mean": self.lens.mean, "lens_axes": self.lens.axes}
+        nets = [{name: x.cpu() for name, x in net.state_dict().items()} for net in self.nets]
+        return {"nets": nets, **{name: torch.from_numpy(array) for name, array in arrays.items()}}
 
 
 def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> NetworkSnapshot:
@@ -139,48 +151,72 @@ def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> Netwo
         net = SimilarityNet(data["visual"].shape[1], config, torch.Generator())
         net.load_state_dict(weights)
         nets.append(net.to(device))
+    lens = None
+    if "lens_mean" in data:  # snapshots of before one could start from another have none
+        lens = Lens(mean=data["lens_mean"].numpy(), axes=data["lens_axes"].numpy())
     return NetworkSnapshot(
         number=data["number"], config=config, nets=nets, visual=data["visual"].numpy(),
-        mean=data["mean"].numpy(), std=data["std"].numpy(),
+        mean=data["mean"].numpy(), std=data["std"].numpy(), lens=lens,
     )  # fmt: skip
 
 
 def fit(
     ratings: Sequence[RatedSegment], frames: np.ndarray, view: View, config: PredictorConfig,
-    *, number: int, seed: int, device: str = "cpu",
+    *, number: int, seed: int, device: str = "cpu", start: Snapshot | None = None,
 ) -> tuple[NetworkSnapshot, FitStats]:  # fmt: skip
-    """Fits ``config.members`` networks. Arguments and result as ``predictor.fit``."""
+    """Fits ``config.members`` networks. Arguments and result as ``predictor.fit``.
+
+    With a start, member i begins with the weights of the start's member i (and its input scales), and
+    all of them are fine-tuned, as in the paper.
+    """
+    assert start is None or isinstance(start, NetworkSnapshot), "predictor.fit has checked it"
     generator = torch.Generator().manual_seed(seed)
     obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
     inputs = standard_inputs(obs, actions)
     mean, std = inputs.mean(axis=(0, 1)), inputs.std(axis=(0, 1)) + 0.05
+    if start is not None:
+        mean, std = start.mean, start.std
     standard_nWS = torch.from_numpy((inputs - mean) / std).to(device)
     # Looked up frame by frame: with many ratings the visual inputs of all pairs would fill the memory.
     frames_nW = torch.from_numpy(frames.astype(np.int64)).to(device)
     visual_FV = torch.from_numpy(view.visual).to(device)
     classes_n = torch.tensor([r.value - 1 for r in ratings])
     nets, losses = [], []
-    for _ in range(config.members):
-        net, loss = _fit_one(standard_nWS, frames_nW, visual_FV, classes_n, config, generator, device)
+    for member in range(config.members):
+        net = SimilarityNet(view.visual.shape[1], config, generator).to(device)
+        if start is not None:
+            _take_weights(net, start, member)
+        rate = config.learning_rate * (1.0 if start is None else _TUNED)
+        loss = _fit_one(net, standard_nWS, frames_nW, visual_FV, classes_n, config, rate, generator, device)
         nets.append(net)
         losses.append(loss)
     snapshot = NetworkSnapshot(
-        number=number, config=config, nets=nets, visual=view.visual, mean=mean, std=std
-    )
+        number=number, config=config, nets=nets, visual=view.visual, mean=mean, std=std,
+        lens=view.lens,
+    )  # fmt: skip
     some = slice(None, None, -(-len(ratings) // _JUDGED_CLIPS))
     chosen = snapshot.probabilities(frames[some], obs[some], actions[some]).mean(axis=1).argmax(axis=-1)
     hit = float((chosen == classes_n[some].numpy()).mean())
     return snapshot, FitStats(loss=float(np.mean(losses)), accuracy=hit)
 
 
+def _take_weights(net: SimilarityNet, start: NetworkSnapshot, member: int) -> None:
+    weights = start.nets[member % len(start.nets)].state_dict()
+    if weights["fuse_visual.weight"].shape != net.fuse_visual.weight.shape:
+        raise UserError(
+            f"the predictor to start from sees {weights['fuse_visual.weight'].shape[1]} numbers of a frame, "
+            f"this run {net.fuse_visual.weight.shape[1]}: use the same encoder and predictor.visual_dims"
+        )
+    net.load_state_dict(weights)
+
+
 def _fit_one(
-    standard_nWS: torch.Tensor, frames_nW: torch.Tensor, visual_FV: torch.Tensor, classes_n: torch.Tensor,
-    config: PredictorConfig, generator: torch.Generator, device: str,
-) -> tuple[SimilarityNet, float]:  # fmt: skip
-    """One network, and its mean loss over the last tenth of the updates."""
-    net = SimilarityNet(visual_FV.shape[1], config, generator).to(device)
+    net: SimilarityNet, standard_nWS: torch.Tensor, frames_nW: torch.Tensor, visual_FV: torch.Tensor,
+    classes_n: torch.Tensor, config: PredictorConfig, rate: float, generator: torch.Generator, device: str,
+) -> float:  # fmt: skip
+    """Trains one network; its mean loss over the last tenth of the updates."""
     optimiser = torch.optim.SGD(
-        net.parameters(), lr=config.learning_rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
+        net.parameters(), lr=rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
     )
     counts = torch.bincount(classes_n, minlength=CLASSES)
     weights = class_weights(counts).to(device) if config.class_weights else None
@@ -199,7 +235,7 @@ def _fit_one(
     ):
         # The learning rate falls to 0 along half a cosine (Loshchilov and Hutter 2017, eq. 5).
         fall = 0.5 * (1 + math.cos(math.pi * update / config.updates))
-        optimiser.param_groups[0]["lr"] = config.learning_rate * fall
+        optimiser.param_groups[0]["lr"] = rate * fall
         pair = (clip[:, None], step)
         logits = net(visual_FV[frames_nW[pair]], standard_nWS[pair]).flatten(0, 1)
         target = targets_n5[clip].repeat_interleave(pairs, dim=0)
@@ -209,7 +245,7 @@ def _fit_one(
         loss.backward()
         optimiser.step()
         losses.append(loss.detach())
-    return net, float(torch.stack(losses[-max(1, config.updates // 10) :]).mean())
+    return float(torch.stack(losses[-max(1, config.updates // 10) :]).mean())
 
 
 def _targets(classes_n: torch.Tensor, ordinal: bool) -> torch.Tensor:

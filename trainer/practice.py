@@ -54,7 +54,7 @@ class PracticeConfig:
     """How far the elastic clock may be from real time, either way."""
     bank_share: float = 0.5
     """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
-    give_up: float = 0.15
+    give_up: float = 0.25
     """An episode ends when the running similarity, 0..1, falls below this; 0: never."""
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ import importlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from trainer.appearance import Track
+from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.store import RatedSegment
 
@@ -81,6 +82,22 @@ class PredictorConfig:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class Lens:
+    """How frame features become visual inputs. Fitted on one demo; others can be seen through it, too."""
+
+    mean: np.ndarray
+    """Of the features, (D,), float32."""
+    axes: np.ndarray
+    """Principal components with their scale, (D, V); or the scale of each feature alone, (D,). float32."""
+
+    def see(self, features: np.ndarray) -> np.ndarray:
+        """Visual inputs of frames, (F, D) to (F, V), float32."""
+        centred = features.astype(np.float64) - self.mean
+        seen = centred @ self.axes if self.axes.ndim == 2 else centred * self.axes
+        return seen.astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class View:
     """The demo as a predictor sees it."""
 
@@ -88,6 +105,12 @@ class View:
     """Principal components of the frame features, (F, V), float32."""
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
+    basis: np.ndarray
+    """Functions of the frames that an unknown track is made of (``trainer/imagined.py``), (F, R), float32."""
+    fps: float
+    """Frames per second."""
+    lens: Lens | None = None
+    """How ``visual`` was made of the features; needed if another run is to start from the predictor."""
 
 
 class Snapshot(ABC):
@@ -97,6 +120,9 @@ class Snapshot(ABC):
         number: 1, 2, ... within a run.
         config: How it was fitted.
     """
+
+    lens: Lens | None = None
+    """What it sees the frames through, if it sees visual inputs."""
 
     def __init__(self, *, number: int, config: PredictorConfig) -> None:
         self.number = number
@@ -114,6 +140,17 @@ class Snapshot(ABC):
         Returns:
             (members, ..., 5), float32, for ratings 1 to 5.
         """
+
+    def beside(self, view: View) -> Snapshot | None:
+        """The same predictor beside another demo, as snapshot 0: what is known before the first rating.
+
+        Returns:
+            None where nothing is: what the demo shows has to be learned from ratings first.
+
+        Raises:
+            UserError: If predictors of this kind cannot start another run.
+        """
+        raise UserError(f"a run cannot start from a predictor of kind {self.config.kind!r}")
 
     @abstractmethod
     def tensors(self) -> dict[str, Any]:
@@ -176,31 +213,54 @@ class FitStats:
 
 def fit(
     ratings: Sequence[RatedSegment], frames: np.ndarray, view: View, config: PredictorConfig,
-    *, number: int, seed: int, device: str = "cpu",
+    *, number: int, seed: int, device: str = "cpu", start: Snapshot | None = None,
 ) -> tuple[Snapshot, FitStats]:  # fmt: skip
-    """Fits a predictor from scratch on all ratings: the same ratings and seed give the same weights.
+    """Fits a predictor on all ratings: the same ratings, seed and start give the same weights.
+
+    It never goes on from the run's last snapshot: without a start it is fitted from scratch, with one
+    from there.
 
     Args:
         ratings: n rated segments, all of W steps.
         frames: Index of the demo frame at each step of each segment, (n, W).
         view: The demo.
-        config: Which kind, and how; a "metric" of a demo without a track is a "network".
+        config: Which kind, and how.
         number: The snapshot's number.
         seed: Of everything random.
         device: Where torch computes; what is drawn at random is the same everywhere.
+        start: Fitted on the ratings of another move, to be fine-tuned (the paper's section "Transfer
+            learning to hopping task").
 
     Returns:
         The snapshot and how the fit went.
 
     Raises:
         ValueError: If there is no rating.
+        UserError: If the start is of another kind or size.
     """
     if not ratings:
         raise ValueError("a similarity predictor needs at least one rating")
-    if config.kind == "metric" and view.track is None:
-        config = replace(config, kind="network")  # what is saved says how it is to be read
+    if start is not None:
+        check_start(start, config)
     module = importlib.import_module(KINDS[config.kind])
-    return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device)
+    return module.fit(ratings, frames, view, config, number=number, seed=seed, device=device, start=start)
+
+
+def check_start(start: Snapshot, config: PredictorConfig) -> None:
+    """Raises UserError if fits of this config cannot start from ``start``."""
+    if start.config.kind != config.kind:
+        raise UserError(
+            f"the predictor to start from is of kind {start.config.kind!r}, and this run fits one of kind "
+            f"{config.kind!r}; choose a run with --set predictor.kind={config.kind}"
+        )
+    same = ("hidden", "additional_layer") if config.kind == "network" else ()
+    for name in same:
+        theirs, ours = getattr(start.config, name), getattr(config, name)
+        if theirs != ours:
+            raise UserError(
+                f"the predictor to start from has predictor.{name} = {theirs}, this run has {ours}; "
+                "they must be the same"
+            )
 
 
 def expected(probabilities: np.ndarray) -> np.ndarray:
@@ -209,7 +269,12 @@ def expected(probabilities: np.ndarray) -> np.ndarray:
 
 
 def visual_inputs(features: np.ndarray, dims: int) -> np.ndarray:
-    """Frame features as the predictor sees them: centred, and turned onto their principal components.
+    """Frame features as the predictor sees them, through a lens of their own: (F, D) to (F, V)."""
+    return fit_lens(features, dims).see(features)
+
+
+def fit_lens(features: np.ndarray, dims: int) -> Lens:
+    """Centres frame features and turns them onto their principal components.
 
     Departs from the paper, which feeds all 4096 features: with a few hundred ratings, the few
     directions in which one demo's frames differ are all that can be learned from. No rating and no
@@ -220,17 +285,21 @@ def visual_inputs(features: np.ndarray, dims: int) -> np.ndarray:
         dims: Components to keep, V; 0 keeps D.
 
     Returns:
-        (F, V), float32, of about unit variance in the first component.
+        What gives inputs of about unit variance in the first component.
     """
-    centred = features.astype(np.float64) - features.mean(axis=0)
+    mean = features.mean(axis=0)
+    centred = features.astype(np.float64) - mean
     if dims == 0:
-        return (centred / (centred.std(axis=0) + 1e-6)).astype(np.float32)
+        return Lens(mean=mean, axes=(1 / (centred.std(axis=0) + 1e-6)).astype(np.float32))
     # By the frames' inner products: a demo has fewer frames than a frame has features.
     squares, vectors = np.linalg.eigh(centred @ centred.T)
     order = np.argsort(squares)[::-1][: min(dims, features.shape[1])]
-    components = vectors[:, order] * np.sqrt(np.maximum(squares[order], 0.0))
+    squares, vectors = squares[order], vectors[:, order]
     # The sign of an eigenvector is open: fix it, so that two machines agree on what a snapshot's inputs mean.
-    components *= np.where(
-        components[np.abs(components).argmax(axis=0), np.arange(components.shape[1])] < 0, -1, 1
-    )
-    return (components / (components[:, 0].std() + 1e-12)).astype(np.float32)
+    vectors *= np.where(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(order))] < 0, -1, 1)
+    # Directions in which these frames do not differ are nothing but rounding.
+    lengths = np.sqrt(np.maximum(squares, 0.0))
+    there = lengths > 1e-6 * lengths[0]
+    axes = np.where(there, centred.T @ vectors / np.where(there, lengths, 1.0), 0.0)
+    scale = (vectors[:, 0] * lengths[0]).std() + 1e-12
+    return Lens(mean=mean, axes=(axes / scale).astype(np.float32))

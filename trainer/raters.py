@@ -72,6 +72,8 @@ class Oracle(Judge):
         errors: Errors = (),
     ) -> None:
         super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
+        self.hidden = hidden
+        """The demo's states."""
         self._demo = appearance(hidden.qpos, hidden.qvel)
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
@@ -89,7 +91,7 @@ class Oracle(Judge):
         Returns:
             1..5, without any error. Costs nothing of the budget: no learner gets to see it.
         """
-        return float(self._rating(self.distance(qpos, qvel, 0)).mean())
+        return float(self.rating_of(self.distance(qpos, qvel, 0)).mean())
 
 
 def appearance(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:

@@ -145,6 +145,8 @@ class Status:
     """"starting", "pretrain", "online", "paused", "done", "stopped" or "failed"."""
     message: str
     """One plain sentence for people who do not know what a policy is."""
+    method: str = ""
+    """How the run learns: "onedemo" or "paper"."""
     error: str = ""
     """If it failed: what went wrong, one sentence."""
     iteration: int = 0

@@ -284,6 +284,49 @@ class Collector:
         self._obs = self.env.obs
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Acting:
+    """A policy that never changes and the rules that move the demo beside it, for evaluation and for the eye.
+
+    Rules note what happens, so each user has an object of its own.
+    """
+
+    policy: PolicySnapshot
+    """Acts."""
+    rules: EpisodeRules
+    """Move the demo's clock; their starts and stops are not used."""
+
+    def step(
+        self, env: envs.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray, elapsed: int,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[Step, np.ndarray, np.ndarray]:  # fmt: skip
+        """One control step of all lanes, none of which may end with it.
+
+        Args:
+            env: The lanes.
+            obs: What they show, (N, o).
+            clock: Demo step of each, (N,).
+            elapsed: Control steps since they began, before this one.
+            rng: Samples the action; None takes its mean.
+
+        Returns:
+            The step, the environment's rewards (N,), and the demo step after it (N,), which stays at the
+            policy's horizon once it gets there.
+        """
+        actions = self.policy.act(self.policy.inputs(obs, clock), rng)
+        next_obs, rewards, _, _, _ = env.step(actions)
+        step = Step(
+            obs=obs,
+            actions=actions,
+            clock=clock,
+            elapsed=np.full(len(clock), elapsed + 1, np.int32),
+            next_obs=next_obs,
+            next_qpos=env.qpos,
+            next_qvel=env.qvel,
+        )
+        return step, rewards, np.minimum(self.rules.advance(step), self.policy.horizon).astype(np.int32)
+
+
 def evaluate(
     policy: PolicySnapshot,
     env_name: str,
@@ -315,7 +358,7 @@ def evaluate(
         UserError: If the environment is unknown.
     """
     horizon = policy.horizon if horizon is None else horizon
-    rules = rules or EpisodeRules()
+    acting = Acting(policy=policy, rules=rules or EpisodeRules())
     # One step more than asked, so that the last state is seen before the restart.
     env = envs.make(env_name, episodes, horizon=horizon + 1, nthread=nthread)
     rng = None if deterministic else np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
@@ -324,21 +367,10 @@ def evaluate(
     states = [(obs, env.qpos, env.qvel, clock)]
     actions, rewards = [], []
     for t in range(horizon):
-        action = policy.act(policy.inputs(obs, clock), rng)
-        next_obs, reward, _, _, _ = env.step(action)
-        step = Step(
-            obs=obs,
-            actions=action,
-            clock=clock,
-            elapsed=np.full(episodes, t + 1, np.int32),
-            next_obs=next_obs,
-            next_qpos=env.qpos,
-            next_qvel=env.qvel,
-        )
-        clock = np.minimum(rules.advance(step), policy.horizon).astype(np.int32)
-        obs = next_obs
+        step, reward, clock = acting.step(env, obs, clock, t, rng)
+        obs = step.next_obs
         states.append((obs, step.next_qpos, step.next_qvel, clock))
-        actions.append(action)
+        actions.append(step.actions)
         rewards.append(reward)
     env.close()
     columns = [np.stack(column, axis=1) for column in zip(*states, strict=True)]

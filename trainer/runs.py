@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from importlib.metadata import version
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 from trainer.config import RunConfig, load_config, to_toml
 from trainer.demo_checks import check_name
@@ -54,15 +55,40 @@ def find_run(
         config = replace(config, device=wanted.device)
     if wanted is not None and wanted != config:
         raise UserError(
-            f"run {run['id']!r} has other settings than those given (see {file}); "
-            "use the same or none, or start a new run with --new-run"
+            f"run {run['id']!r} has other settings than those given: {_differences(config, wanted)} "
+            f"(see {file}); use the same or none, or start a new run with --new-run"
         )
     return run["id"], config
 
 
-def _of_before(file: Path) -> dict[str, str]:
+def _of_before(file: Path) -> dict[str, Any]:
     """What a config of before there were two methods leaves out: those runs are the paper's."""
-    return {} if re.search(r"^method = ", file.read_text(), re.MULTILINE) else {"method": "paper"}
+    text = file.read_text()
+    if re.search(r"^method = ", text, re.MULTILINE):
+        return {}
+    max_kl = re.search(r"^max_kl = (\S+)$", text, re.MULTILINE)
+    stayed = {"trpo.final_kl": float(max_kl[1])} if max_kl else {}
+    return {"method": "paper"} | stayed
+
+
+def _differences(made: RunConfig, wanted: RunConfig) -> str:
+    """Where two configs differ: of other methods only that, of which the rest follows."""
+    if made.method != wanted.method:
+        return f"method is {made.method!r}, not {wanted.method!r}"
+    theirs, ours = _leaves(made), _leaves(wanted)
+    return ", ".join(
+        f"{key} is {theirs[key]!r}, not {ours[key]!r}" for key in ours if ours[key] != theirs[key]
+    )
+
+
+def _leaves(config: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted key to value."""
+    found: dict[str, Any] = {}
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        nested = is_dataclass(value)
+        found |= _leaves(value, f"{prefix}{entry.name}.") if nested else {prefix + entry.name: value}
+    return found
 
 
 def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name: str | None) -> str:

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from trainer.predictor import STANDARD_DIMS, standard_inputs
+from trainer.network import STANDARD_DIMS, standard_inputs
 from trainer.records import Segment
 
 Pair = tuple[Segment, Segment]

@@ -11,6 +11,9 @@ from trainer.bench.document import about
 from trainer.bench.study import Outcome, by_label, kind_of
 from trainer.bench.tables import TUNING_FROM
 
+_IN_ITS_FILE = ("curve", "errors", "episode")
+"""What a result may hold that is too long for a report's figures."""
+
 
 def complete(report: Document, outcomes: Sequence[Outcome], *, command: str, quick: bool) -> Document:
     """A table's report with what every report has to say: what was run, with what, and what is missing.
@@ -61,9 +64,9 @@ def _runs(outcomes: Sequence[Outcome]) -> list[Block]:
 
 
 def _record(outcome: Outcome) -> dict[str, Any]:
-    """Of one run, without its curves: they are in its own file."""
+    """Of one run, without its curves and its episode: they are in its own file."""
     job = outcome.job
     kept = {key: value for key, value in (outcome.kept or {}).items() if key != "machine"}
     if outcome.result is not None:
-        kept["result"] = {key: value for key, value in outcome.result.items() if key != "curve"}
+        kept["result"] = {k: value for k, value in outcome.result.items() if k not in _IN_ITS_FILE}
     return {**job.description, **kept, "label": job.label, "key": job.key, "state": outcome.state}

@@ -34,7 +34,9 @@ class Kind:
 
     function: str
     """"module:function", ``run(settings: dict, seed: int, scratch: Path) -> dict``: what was measured, its
-    curves included, as JSON knows it. It is imported by the process that runs it."""
+    curves included, as JSON knows it. It is imported by the process that runs it. If it takes a ``cache``,
+    it gets a directory that all jobs of a directory of results share: what is the same for all of them,
+    such as a demo's features, is worked out once."""
     version: int = 1
     """To be raised when the same settings and seed would give another result (learning, physics,
     evaluation), and only then: results of older versions count as not run."""
@@ -42,6 +44,9 @@ class Kind:
 
 KINDS = {
     "method": Kind("trainer.bench.method:run"),
+    "transfer": Kind("trainer.bench.transfer:run"),
+    "person": Kind("trainer.bench.person:run"),
+    "predictor": Kind("trainer.bench.predictor_trial:run"),
     "handcoded": Kind("trainer.bench.controls:handcoded"),
     "preferences": Kind("trainer.bench.controls:preferences"),
     "truth": Kind("trainer.bench.controls:truth"),
@@ -304,6 +309,7 @@ def _start(job: Job, results: Path) -> _Child | Outcome | None:
         request = {
             "file": str(file.absolute()),
             "function": kind_of(job).function,
+            "cache": str((results / "cache").absolute()),
             "label": job.label,
             **job.description,
         }

@@ -9,6 +9,7 @@ however it went.
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import os
 import shutil
@@ -36,8 +37,10 @@ def main(request_json: str) -> None:
     source = program()  # before the work: somebody may edit meanwhile
     try:
         run = find_function(request.pop("function"))
+        cache = Path(request.pop("cache"))
+        places = {"cache": cache} if "cache" in inspect.signature(run).parameters else {}
         began, began_cpu = time.monotonic(), time.process_time()
-        result = run(request["settings"], request["seed"], scratch)
+        result = run(request["settings"], request["seed"], scratch, **places)
         wall_s, cpu_s = time.monotonic() - began, time.process_time() - began_cpu
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -54,7 +57,7 @@ def main(request_json: str) -> None:
     write_atomic(file, (json.dumps(kept, allow_nan=False) + "\n").encode())
 
 
-def find_function(name: str) -> Callable[[dict[str, Any], int, Path], Mapping[str, Any]]:
+def find_function(name: str) -> Callable[..., Mapping[str, Any]]:
     """The function that "module:function" names."""
     module, _, function = name.partition(":")
     return getattr(importlib.import_module(module), function)

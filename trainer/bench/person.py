@@ -1,0 +1,69 @@
+"""The job behind the case study: a video of a real person, and a rater that goes by hand-made marks.
+
+Settings of a job are those of ``trainer.bench.method`` without ``demo``; the rater "script", which errors
+may follow, goes by the marks beside this file. The video is not part of this program.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from trainer.bench import method
+from trainer.bench.study import Job
+from trainer.demos import import_video
+from trainer.errors import UserError
+from trainer.files import hold
+from trainer.records import Demo
+
+VIDEO = "person_backflip_480.mp4"
+VARIABLE = "ONEDEMO_PERSON_VIDEO"
+MARKS = Path(__file__).with_name("person_backflip.json")
+
+_FOLDER = Path(__file__).parents[2].parent / "shared" / "videos"
+_DEMO = "person-backflip"
+
+
+def video() -> Path:
+    """The person's video: what the variable names, else where a source tree has it beside it.
+
+    Raises:
+        UserError: If it is not there.
+    """
+    path = Path(os.environ.get(VARIABLE) or _FOLDER / VIDEO)
+    if not path.is_file():
+        where = f"{VARIABLE}={path}" if os.environ.get(VARIABLE) else f"../shared/videos/{VIDEO}"
+        raise UserError(f"there is no video at {where}; name it with the environment variable {VARIABLE}")
+    return path
+
+
+def person_demo(demos_dir: Path) -> Demo:
+    """The video as a demo, brought in if it is not yet.
+
+    Raises:
+        UserError: If it is not there or cannot be read.
+    """
+    return import_video(video(), name=_DEMO, demos_dir=demos_dir)
+
+
+def person_job(
+    label: str, seed: int, *, method: str = "onedemo", rater: str = "script", ratings: int = 350, steps: int,
+    changes: Mapping[str, Any] | None = None,
+) -> Job:  # fmt: skip
+    """A job of kind "person". Arguments as ``trainer.bench.method.method_job``."""
+    settings = {
+        "method": method, "rater": rater, "ratings": ratings, "steps": steps, "set": dict(changes or {}),
+    }  # fmt: skip
+    return Job(kind="person", label=label, settings=settings, seed=seed)
+
+
+def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:
+    """Trains on the person's video and evaluates: arguments and result as ``trainer.bench.method.run``."""
+    cache = cache or scratch
+    with hold(cache / "lock", wait=True):
+        demo = person_demo(cache / "demos")
+    kind, *errors = settings["rater"].split("+")
+    rater = "+".join([f"script:{MARKS}" if kind == "script" else kind, *errors])
+    return method.run({**settings, "demo": demo.name, "rater": rater}, seed, scratch, cache)
