@@ -25,7 +25,7 @@ from trainer.bench.summary import (
 
 TITLE = "onedemo: the backflip"
 SEEDS = 5
-STEPS = 1_000_000
+STEPS = 1_500_000
 """Control steps of every training from ratings, and of those on the true rating."""
 BASELINE_STEPS = 3_000_000
 """Of the two baselines without a demo."""

@@ -4,7 +4,7 @@ Settings of a job: ``demo``, ``method``, ``rater``, ``ratings`` (in all), ``step
 ``set``, more settings by their dotted names. The result, which the controls have in the same form:
 
 - ``figures``: of the final policy, name to {mean, best, worst, each}, each of 16 episodes;
-- ``curve``: name to means over 16 episodes, at about 20 points of ``env_steps``;
+- ``curve``: name to means over 16 episodes, at about 12 points of ``env_steps``;
 - ``errors``: squared error of the states over time, of the best episode and the mean;
 - ``episode``: positions of the best episode at the demo's frames, and which one it is;
 - ``ratings``, ``ratings_by_class``, ``env_steps`` and ``seconds`` by what they were spent on.
@@ -39,7 +39,7 @@ from trainer.rollouts import Episodes
 from trainer.store import Store
 from trainer.timing import steps_of_frames
 
-POINTS = 20
+POINTS = 12
 """Of a learning curve."""
 CURVES = ("net_turns", "clean_turns", "landings", "backflip_reward", "hop_return", "aligned_similarity")
 """Figures that are followed during a training."""
