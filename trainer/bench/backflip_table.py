@@ -44,21 +44,22 @@ _VARIANTS = (_OURS, _FEW, _ON_CLEAN, _ERRS, _BLIND)
 
 
 def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
-    """Seed by seed, so that there is something of everything early."""
-    return [job for seed in seeds for job in (_quick(seed) if quick else _whole(seed))]
+    """Row by row, all seeds of the first row first."""
+    of_seeds = [_quick(seed) if quick else _whole(seed) for seed in seeds]
+    return [job for row in zip(*of_seeds, strict=True) for job in row]
 
 
 def _whole(seed: int) -> list[Job]:
     return [
         method_job(_OURS, seed, steps=STEPS),
-        method_job(_PAPER, seed, method="paper", steps=STEPS),
         method_job(_ON_CLEAN, seed, demo=_CLEAN, steps=STEPS),
         method_job(_FEW, seed, ratings=100, steps=STEPS),
         method_job(_ERRS, seed, rater="oracle+mistake:0.1+jitter", steps=STEPS),
+        _control("handcoded", _HAND, seed, steps=BASELINE_STEPS),
+        method_job(_PAPER, seed, method="paper", steps=STEPS),
         method_job(_BLIND, seed, steps=STEPS, changes={"predictor.appearance": False}),
         _control("truth", _TRUTH_ELASTIC, seed, method="onedemo", steps=STEPS),
         _control("truth", _TRUTH_FIXED, seed, method="paper", steps=STEPS),
-        _control("handcoded", _HAND, seed, steps=BASELINE_STEPS),
         _control("preferences", _PREFERENCES, seed, comparisons=RATINGS, steps=BASELINE_STEPS),
     ]
 
