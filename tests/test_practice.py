@@ -163,7 +163,7 @@ def given_up_after(rules, places, start=0, limit=100):
 
 def test_an_episode_is_given_up_once_its_running_similarity_is_too_low():
     far, near = 10**4, 0
-    rules = make_rules(PracticeConfig(elastic=False), lanes=2, width=10**3)
+    rules = make_rules(PracticeConfig(elastic=False, give_up=0.15), lanes=2, width=10**3)
     # It starts at 0.6 and falls by a 25th a step: 0.6 (24/25)^n < 0.15 from n = 34 on.
     assert given_up_after(rules, [far, near]).tolist() == [34, 100]
 
@@ -176,10 +176,18 @@ def test_nothing_is_given_up_in_the_first_steps_of_an_episode():
 
 
 def test_a_new_episode_is_a_new_chance():
-    rules = make_rules(PracticeConfig(elastic=False), lanes=2, width=1.0)
+    rules = make_rules(PracticeConfig(elastic=False, give_up=0.15), lanes=2, width=1.0)
     assert given_up_after(rules, [10**4, 10**4], limit=34).tolist() == [34, 34]
     rules.start(np.array([0]), np.random.default_rng(0))  # the other one's goes on, unlike in a run
     assert given_up_after(rules, [10**4, 10**4]).tolist() == [34, 1]
+
+
+def test_a_timid_predictor_gives_up_later():
+    """What counts is the share of what the predictor gives at best: half of 0.3 is 0.15."""
+    rules = make_rules(PracticeConfig(elastic=False, give_up=0.3), lanes=2, width=10**3)
+    none = np.zeros((1, 6))
+    rules.use(rules._snapshot, Bank(qpos=none, qvel=none, clock=np.zeros(1, np.int32), similarity=0.5))
+    assert given_up_after(rules, [10**4, 0]).tolist() == [34, 100]
 
 
 def test_it_can_be_switched_off():
@@ -265,7 +273,7 @@ def test_practice_in_the_real_environment():
     """Clocks, starts and rewards belong together, step by step, episode by episode."""
     lanes, horizon = 8, 60
     qpos = np.tile([0, 1.25, 0.5, 0, 0, 0], (3, 1))
-    bank = Bank(qpos=qpos, qvel=np.zeros((3, 6)), clock=np.array([0, 20, 40], np.int32))
+    bank = Bank(qpos=qpos, qvel=np.zeros((3, 6)), clock=np.array([0, 20, 40], np.int32), similarity=1.0)
     config = PracticeConfig(slack_seconds=6 * DT, give_up=0.3)
     rules = make_rules(config, lanes=lanes, demo_steps=horizon)
     rules.use(Leaning(6.0), bank)

@@ -247,7 +247,7 @@ class Learner:
         if snapshot.number == self._banked:
             return
         bank = None
-        if self.config.practice.bank_share:
+        if self.config.practice.bank_share or self.config.practice.give_up:
             rng = np.random.default_rng([self.config.seed, snapshot.number])
             bank = fill_bank(snapshot, self._wild_rollouts(), self.frames_of, self.demo_steps, rng)
         rules.use(snapshot, bank)

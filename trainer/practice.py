@@ -54,8 +54,9 @@ class PracticeConfig:
     """How far the elastic clock may be from real time, either way."""
     bank_share: float = 0.5
     """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
-    give_up: float = 0.25
-    """An episode ends when the running similarity, 0..1, falls below this; 0: never."""
+    give_up: float = 0.3
+    """An episode ends when the running similarity falls below this share of that of the bank's states,
+    the most that the predictor gives; 0: never."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.bank_share <= 1:
@@ -81,6 +82,8 @@ class Bank:
     """(n, v)."""
     clock: np.ndarray
     """(n,), int32."""
+    similarity: float
+    """Of its states with the demo, as predicted, their mean, 0..1."""
 
 
 def fill_bank(
@@ -101,17 +104,20 @@ def fill_bank(
     """
     flat = {name: getattr(states, name).reshape(-1, getattr(states, name).shape[-1]) for name in _STATE}
     moments = np.arange(0, max(1, demo_steps - 2 * _BANK_EVERY), _BANK_EVERY)
-    kept = []
+    kept, ratings = [], []
     for moment in moments:
         tried = rng.integers(len(flat["obs"]), size=_BANK_TRIES)
         frame = frames_of(np.full(1, moment))
         liked = snapshot.ratings(frame, flat["obs"][tried], flat["actions"][tried])
-        kept.append(tried[np.argsort(-liked, kind="stable")[:_BANK_KEPT]])
+        best = np.argsort(-liked, kind="stable")[:_BANK_KEPT]
+        kept.append(tried[best])
+        ratings.append(liked[best])
     chosen = np.concatenate(kept)
     return Bank(
         qpos=flat["qpos"][chosen],
         qvel=flat["qvel"][chosen],
         clock=np.repeat(moments, _BANK_KEPT).astype(np.int32),
+        similarity=float(_similarity(np.concatenate(ratings)).mean()),
     )
 
 
@@ -144,6 +150,7 @@ class PracticeRules(EpisodeRules):
         self._frames_of = frames_of
         self._snapshot: Snapshot | None = None
         self._bank: Bank | None = None
+        self._threshold = config.give_up
         self._running = np.full(lanes, _FRESH)
         self._age = np.zeros(lanes, np.int64)
         self._similar = np.zeros(lanes)
@@ -155,6 +162,7 @@ class PracticeRules(EpisodeRules):
     def use(self, snapshot: Snapshot, bank: Bank | None) -> None:
         """From now on similarity is what this snapshot says, and episodes may start in this bank."""
         self._snapshot, self._bank = snapshot, bank
+        self._threshold = self._config.give_up * (bank.similarity if bank is not None else 1.0)
 
     def take_rewards(self) -> np.ndarray:
         """Rewards of the steps since the last call, (N, T): similarity, 0..1, times steps moved."""
@@ -200,7 +208,7 @@ class PracticeRules(EpisodeRules):
         """True where the robot has been unlike the demo for a while."""
         self._running += (self._similar - self._running) / _MEMORY
         self._age += 1  # not ``elapsed``, which begins in the middle of the demo with a state of the bank
-        return (self._running < self._config.give_up) & (self._age > _GRACE)
+        return (self._running < self._threshold) & (self._age > _GRACE)
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed practice needs besides snapshot and bank."""
@@ -215,4 +223,9 @@ class PracticeRules(EpisodeRules):
         assert self._snapshot is not None
         frames = self._frames_of(np.minimum(clock, self._demo_steps - 1))
         ratings = self._snapshot.ratings(frames, step.next_obs, step.actions)
-        return np.clip((ratings - 1) / (CLASSES - 1), 0, 1)
+        return _similarity(ratings)
+
+
+def _similarity(ratings: np.ndarray) -> np.ndarray:
+    """Ratings 1..5 as 0..1."""
+    return np.clip((ratings - 1) / (CLASSES - 1), 0, 1)
