@@ -39,13 +39,11 @@ SWITCHES: Mapping[str, tuple[str, ...]] = {
 }
 """What each is called, and its settings."""
 
-_TOGETHER = ("appearance", "a learned distance")
 ON: Mapping[str, tuple[str, ...]] = {
-    " and ".join(_TOGETHER): tuple(key for name in _TOGETHER for key in SWITCHES[name]),
-    **{name: keys for name, keys in SWITCHES.items() if name not in _TOGETHER},
+    **{name: keys for name, keys in SWITCHES.items() if name != "appearance"},
+    "a learned distance and appearance": (*SWITCHES["a learned distance"], *SWITCHES["appearance"]),
 }
-"""The same for the paper's method. Of appearance the paper's network makes nothing, and without it there is
-no distance to be measured: these two go together."""
+"""The same for the paper's method, whose network makes nothing of appearance alone."""
 
 _OURS, _PAPER = "onedemo", "paper"
 _QUICK = {_OURS: ("an elastic clock", "giving up"), _PAPER: ("an elastic clock",)}
