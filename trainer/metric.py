@@ -46,9 +46,9 @@ _PRIOR = np.repeat([-1.0, -2.0], body.POSE)
 """Log weights before any rating: a difference in pose counts more than one in motion."""
 _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
-_TRUST = 2.0
+_TRUST = 8.0
 """Of the penalty that holds all numbers near those of a start, over the number of ratings. As a prior it
-is a standard deviation of 0.5: another move's weights are taken to be right within a factor of 1.6."""
+is a standard deviation of 0.25: another move's weights are taken to be right within a factor of 1.3."""
 _MOST, _LEAST = 3.0, 0.3
 """Limits of a class's weight in the loss; classes are weighed to count equally."""
 _TINY = 1e-4

@@ -1,6 +1,7 @@
 """The jobs behind Table 3: a predictor of one move, fine-tuned to another with few ratings.
 
-Settings of a job: ``source`` and ``target``, each the settings of ``trainer.bench.method``. The source run
+Settings of a job: ``source`` and ``target``, each the settings of ``trainer.bench.method``, and
+``demo``, the target's. The source run
 is trained first, for its ratings and its predictor alone; the target run starts from its newest snapshot.
 The result is that of the target run, with what the source cost.
 """
@@ -31,7 +32,7 @@ def transfer_job(label: str, seed: int, *, source: Job, target: Job) -> Job:
         source: Of kind "method": what the predictor is made for.
         target: Of kind "method": what it is fine-tuned to.
     """
-    settings = {"source": source.settings, "target": target.settings}
+    settings = {"demo": target.settings["demo"], "source": source.settings, "target": target.settings}
     return Job(kind="transfer", label=label, settings=settings, seed=seed)
 
 
