@@ -7,7 +7,6 @@ from trainer.errors import UserError
 from trainer.evaluation import summarise
 from trainer.learner import Learner
 from trainer.metric import MetricSnapshot
-from trainer.network import NetworkSnapshot
 from trainer.rollouts import evaluate
 from trainer.store import RatedSegment
 
@@ -257,12 +256,12 @@ def test_the_policy_sees_what_the_demo_shows_now_and_ahead(features):
         np.testing.assert_allclose(seen, expected, atol=1e-5)  # nothing is normalised yet
 
 
-def test_of_another_body_it_sees_pictures_and_fits_a_network(features):
-    """No track: what the frames look like takes its place, in policy and predictor."""
+def test_of_another_body_it_sees_pictures_and_imagines_poses(features):
+    """No track: what the frames look like takes its place in the policy, and the predictor makes one up."""
     learner = Learner(onedemo(), FRAMES, 30.0)
     learner.look_at(features, None)
     snapshot, _ = learner.fit(rated(learner), 1)
-    assert isinstance(snapshot, NetworkSnapshot)
+    assert isinstance(snapshot, MetricSnapshot)
     assert np.ptp(learner._policy.table, axis=0).max() > 0.5
     _, stats = learner.iterate(snapshot)
     assert 1 <= stats["predicted"] <= 5

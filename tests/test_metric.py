@@ -8,8 +8,8 @@ import torch
 
 from trainer import body
 from trainer.appearance import Track
+from trainer.imagined import track_basis
 from trainer.metric import MetricSnapshot
-from trainer.network import NetworkSnapshot
 from trainer.predictor import PredictorConfig, Snapshot, View, fit
 from trainer.records import Segment
 from trainer.starts import wild_rollouts
@@ -248,16 +248,32 @@ def test_a_saved_snapshot_is_the_same(fitted, tmp_path):
     np.testing.assert_array_equal(predicted(again, ratings, frames), predicted(snapshot, ratings, frames))
 
 
-def test_where_no_pose_is_seen_a_network_is_fitted_and_saved_as_one(fitted, view, rollouts, tmp_path):
-    """A demo of another body: nothing to measure a distance to."""
-    *_, ratings, frames = fitted
-    config = replace(CONFIG, updates=20)
-    snapshot, _ = fit(ratings, frames, replace(view, track=None), config, number=2, seed=0)
-    assert isinstance(snapshot, NetworkSnapshot)
+@pytest.fixture(scope="module")
+def blind(view):
+    """The same demo, of which only features of its frames are seen: a mixture of the poses."""
+    mixture = np.random.default_rng(3).normal(size=(body.POSE, 30))
+    features = np.tanh(view.track.pose @ mixture).astype(np.float32)
+    return replace(view, track=None, basis=track_basis(features, view.fps))
+
+
+def test_where_no_pose_is_seen_the_ratings_say_what_the_demo_shows(blind, rollouts, view, tmp_path):
+    """The track is fitted with the rest; a demo of another body is no different."""
+    ratings, frames, _ = world(rollouts, view, 300, seed=0)
+    unseen, unseen_frames, distance = world(rollouts, view, 300, seed=1)
+    snapshot, _ = fit(ratings, frames, blind, CONFIG, number=2, seed=0)
+    value = predicted(snapshot, unseen, unseen_frames)
+    # How fast the robot is tells something already; what the frames show has to add to that.
+    shuffled = predicted(snapshot, unseen, np.random.default_rng(0).permutation(FRAMES)[unseen_frames])
+    assert rank_correlation(value, -distance) > max(0.7, 0.1 + rank_correlation(shuffled, -distance))
+    tracks = snapshot.tensors()["tracks"]  # twice as many members, each with a track of its own
+    assert len(tracks) == 6 and tracks.std(dim=0).mean(dim=0).min() > 0.01
+    again, _ = fit(ratings, frames, blind, CONFIG, number=2, seed=0)
+    np.testing.assert_array_equal(predicted(again, unseen, unseen_frames), value)
     snapshot.save(tmp_path / "000002.pt")
-    again = Snapshot.load(tmp_path / "000002.pt")
-    assert isinstance(again, NetworkSnapshot) and again.config.members == 3
-    np.testing.assert_array_equal(predicted(again, ratings, frames), predicted(snapshot, ratings, frames))
+    loaded = Snapshot.load(tmp_path / "000002.pt")
+    assert isinstance(loaded, MetricSnapshot) and loaded.number == 2
+    np.testing.assert_array_equal(predicted(loaded, unseen, unseen_frames), value)
+    shapes_agree(snapshot, rollouts)
 
 
 def test_an_empty_segment_list_is_refused(view):
@@ -265,9 +281,12 @@ def test_an_empty_segment_list_is_refused(view):
         fit([], np.empty((0, STEPS), int), view, CONFIG, number=1, seed=0)
 
 
-def test_clips_as_short_as_one_step(view):
-    segment = Segment(
-        obs=np.zeros((1, 11)), actions=np.zeros((1, 3)), qpos=np.zeros((1, 6)), qvel=np.zeros((1, 6))
-    )
-    one = RatedSegment(event=0, demo_step=0, segment=segment, value=2)
-    assert np.isfinite(fit([one], np.zeros((1, 1), int), view, CONFIG, number=1, seed=0)[1].loss)
+@pytest.mark.parametrize("seen", [True, False])
+def test_the_shortest_clips_that_can_be_asked_for(view, blind, seen):
+    """0.05 s, six control steps."""
+    none = {
+        name: np.zeros((6, size)) for name, size in (("obs", 11), ("actions", 3), ("qpos", 6), ("qvel", 6))
+    }
+    one = RatedSegment(event=0, demo_step=0, segment=Segment(**none), value=2)
+    _, stats = fit([one], np.zeros((1, 6), int), view if seen else blind, CONFIG, number=1, seed=0)
+    assert np.isfinite(stats.loss)
