@@ -91,6 +91,7 @@ METHODS: dict[str, dict[str, Any]] = {
         "predictor.kind": "network",
         "predictor.appearance": False,
         "predictor.members": 1,
+        "predictor.visual_dims": 0,
         "practice.elastic": False,
         "practice.bank_share": 0.0,
         "practice.give_up": 0.0,

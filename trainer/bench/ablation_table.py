@@ -41,9 +41,11 @@ SWITCHES: Mapping[str, tuple[str, ...]] = {
 
 ON: Mapping[str, tuple[str, ...]] = {
     **{name: keys for name, keys in SWITCHES.items() if name != "appearance"},
+    "principal components of the features": ("predictor.visual_dims",),
     "a learned distance and appearance": (*SWITCHES["a learned distance"], *SWITCHES["appearance"]),
 }
-"""The same for the paper's method, whose network makes nothing of appearance alone."""
+"""The same for the paper's method, whose network makes nothing of appearance alone; onedemo's distance
+makes nothing of principal components."""
 
 _OURS, _PAPER = "onedemo", "paper"
 _QUICK = {_OURS: ("an elastic clock", "giving up"), _PAPER: ("an elastic clock",)}

@@ -19,7 +19,7 @@ def measure(quick: bool = False) -> list[Result]:
     """The time of a refit on 350 ratings, and of refits on 100 to 100,000."""
     with one_thread():
         learner, _ = learner_and_snapshot(
-            load_config()
+            load_config(None, {"method": "paper", "predictor.visual_dims": 24})
         )  # the first fit of a process loads torch's optimisers
         rollouts = learner.random_rollouts()
         distinct = made_up_ratings(rollouts, _DISTINCT, learner.clip_steps)

@@ -81,7 +81,13 @@ def learner_and_snapshot(config: RunConfig, ratings: int = 350) -> tuple[Learner
 def _against_physics(turns: int) -> list[Result]:
     config = load_config(
         None,
-        {"method": "paper", "rollouts.lanes": LANES, "rollouts.steps": STEPS, "rollouts.threads": cores()},
+        {
+            "method": "paper",
+            "predictor.visual_dims": 24,
+            "rollouts.lanes": LANES,
+            "rollouts.steps": STEPS,
+            "rollouts.threads": cores(),
+        },
     )
     learner, snapshot = learner_and_snapshot(config)
     bare = Bare(LANES)
