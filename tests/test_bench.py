@@ -135,7 +135,7 @@ def test_made_up_ratings_are_skewed_like_those_of_a_random_policy():
     from trainer.config import load_config
     from trainer.learner import Learner
 
-    learner = Learner(load_config(), 240, 30.0)
+    learner = Learner(load_config(None, {"method": "paper"}), 240, 30.0)
     ratings = made_up_ratings(learner.random_rollouts(), 200, learner.clip_steps)
     counts = np.bincount([r.value for r in ratings], minlength=6)[1:]
     assert counts[0] > counts[1] > counts[4] > 0
