@@ -71,14 +71,15 @@ def guide_html(*, examples: bool) -> str:
         "You see two short movements, about a third of a second each, at real speed: a moment of the video, "
         "and beside it something the robot did. How alike are they? Your ratings tell the robot what to "
         "practise.</p><p>You need not know the move, or where in it a moment belongs: only these two "
-        "movements count. At first the robot moves at random, so most pairs deserve a 1.</p></header>"
+        "movements count. At first the robot moves at random, and many pairs have little in "
+        "common: those deserve a 1.</p></header>"
         f'<section><h2>What the numbers mean</h2><ol class="od-scale">{scale}</ol></section>'
         f"<section><h2>Examples from this video</h2>{shown}</section>"
         '<section class="od-two"><div><h2>What to look at</h2><ul class="od-points">'
         "<li><b>Pose</b>: are the limbs bent and turned alike?</li>"
         "<li><b>Direction</b>: does it rise, fall and turn the same way?</li>"
         "<li><b>Pace</b>: as fast, as slow?</li></ul>"
-        "<p>Ignore the background, and where in the picture the robot is. Go by your first impression: "
+        "<p>Ignore the background; how high the robot is counts. Go by your first impression: "
         "there is no right answer to find, and a second or two is enough.</p></div>"
         f'<div><h2>Keys</h2><ul class="od-keys">{keys}</ul></div></section></article>'
     )
@@ -101,6 +102,7 @@ def _examples_html() -> str:
             f"<figcaption><b>{value}</b><span>{text}</span></figcaption></figure>"
         )
     return (
-        '<p class="od-quiet">Both sides are moments of the video; the numbers are what we would give.</p>'
+        '<p class="od-quiet">Both sides are moments of the video; '
+        "the numbers are roughly what we would give.</p>"
         f'<div class="od-examples">{cards}</div>'
     )

@@ -151,3 +151,9 @@ def test_a_run_with_a_method_is_recorded_whole(tmp_path, method):
     file = tmp_path / "config.toml"
     file.write_text(to_toml(config))
     assert load_config(file) == config
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_are_finite(value):
+    with pytest.raises(UserError, match=r"practice\.slack_seconds must be a finite number"):
+        load_config(None, {"practice.slack_seconds": value})

@@ -334,3 +334,16 @@ def test_evaluation_uses_the_elastic_clock(features, by_distance):
     moves = np.diff(episodes.clock, axis=1)
     assert episodes.clock.max() <= STEPS and set(np.unique(moves)) <= {0, 1, 2, 3} and (moves != 1).any()
     assert type(make_learner(features).rules(4, None)).__name__ == "EpisodeRules"
+
+
+def test_random_starts_count_from_anywhere_in_the_demo(features):
+    """Clips paired by time then show all of it, although random motion lasts a second."""
+    learner = make_learner(features, onedemo(ratings__pairing="time"))
+    rollouts = learner.random_rollouts()
+    whole = ~(rollouts.terminated | rollouts.truncated)
+    assert (np.diff(rollouts.clock, axis=1)[whole[:, :-1]] == 1).all()
+    assert rollouts.clock.min() < 10 and rollouts.next_clock.max() > STEPS - 10
+    assert rollouts.next_clock.max() <= STEPS
+    asked = learner.choose(rollouts, None, 200, np.random.default_rng(0))
+    counts, _ = np.histogram([q.demo_step for q in asked], bins=4, range=(0, STEPS - 38))
+    assert counts.min() > 10

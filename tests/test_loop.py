@@ -16,7 +16,7 @@ from trainer import envs
 from trainer.appearance import regress
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from trainer.loop import Simulated, Trainer
+from trainer.loop import Simulated, Trainer, due_in_round
 from trainer.metric import MetricSnapshot
 from trainer.practice import PracticeRules
 from trainer.rollouts import EpisodeRules, evaluate
@@ -527,3 +527,13 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
     assert len(curves[0]) == 4
     assert curves[0] == curves[1]
     assert curves[0] == curves[2]
+
+
+def test_every_round_before_practice_asks_for_more_until_all_are_given():
+    for total in range(1, 21):
+        for rounds in range(1, 13):
+            given = [due_in_round(k, rounds, total) for k in range(1, max(total, rounds) + 1)]
+            assert given[-1] == total and max(given) == total
+            steps = np.diff([0, *given])
+            assert (steps[: given.index(total) + 1] >= 1).all(), (total, rounds)
+    assert [due_in_round(k, 10, 200) for k in (1, 2, 10)] == [20, 40, 200]

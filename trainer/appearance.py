@@ -232,8 +232,8 @@ def _draw_weights(net: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _smooth(x: np.ndarray) -> np.ndarray:
-    """A moving average along time, (F, ...), F > 1. Past the ends it goes on as it came."""
-    padded = np.concatenate([2 * x[:1] - x[1:2], x, 2 * x[-1:] - x[-2:-1]])
+    """A moving average along time, (F, ...). Past the ends it goes on as it came."""
+    padded = np.concatenate([2 * x[:1] - x[1:2], x, 2 * x[-1:] - x[-2:-1]]) if len(x) > 1 else x[[0, 0, 0]]
     return np.sum([weight * padded[i : i + len(x)] for i, weight in enumerate(_SMOOTH)], axis=0)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -230,6 +231,8 @@ def _fit(key: str, value: Any, hint: Any) -> Any:
     """The value in the type of the field; whole numbers are also numbers."""
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
+    if hint is float and isinstance(value, float) and not math.isfinite(value):
+        raise UserError(f"{key} must be a finite number, got {value}")
     if hint in (int, float, str, bool):
         if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
             names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}

@@ -165,7 +165,7 @@ def state_errors(obs: np.ndarray, demo_obs: np.ndarray) -> np.ndarray:
     """Squared error of the states against the demo's at the same time: the paper's figure 3 (c).
 
     A state is the observation with the torso's angle as in a picture, by sine and cosine: a turn more or
-    less cannot be seen. Each of the 12 numbers is divided by its standard deviation over the demo; the
+    less cannot be seen. Each of the 12 numbers is divided by its standard deviation over the demo, at least 0.05; the
     error is the mean over them, so the demo's own mean state has an error of 1 on average.
 
     Args:
@@ -177,7 +177,12 @@ def state_errors(obs: np.ndarray, demo_obs: np.ndarray) -> np.ndarray:
     """
     steps = min(obs.shape[1], len(demo_obs))
     demo = _seen(demo_obs)
-    return np.square((_seen(obs[:, :steps]) - demo[:steps]) / demo.std(axis=0)).mean(axis=-1)
+    scale = np.maximum(demo.std(axis=0), _LEAST_DEVIATION)
+    return np.square((_seen(obs[:, :steps]) - demo[:steps]) / scale).mean(axis=-1)
+
+
+_LEAST_DEVIATION = 0.05
+"""Of a number that hardly moves in the demo, as the torso of a hop: without it, noise would be all."""
 
 
 def _seen(obs: np.ndarray) -> np.ndarray:

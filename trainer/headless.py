@@ -93,8 +93,21 @@ def train(
         "steps_per_s": round(learner.env_steps / practised, 1),
         "wall_s": round(time.monotonic() - began, 2),
         "seed": config.seed,
+        "deterministic": not (why := chance(config, rater)),
+        "not_deterministic_because": why,
         "version": program_version(),
     }
+
+
+def chance(config: RunConfig, rater: str) -> str:
+    """Why the same settings and seed may give another result on the same machine; "" if they may not."""
+    if config.device != "cpu":
+        return f"sums on {config.device} have no fixed order"
+    if config.rollouts.physics != "mujoco":
+        return "contacts on a GPU have no fixed order"
+    if ":" in rater and not rater.startswith(("oracle", "script")):
+        return f"nobody knows what the rater {rater} does"
+    return ""
 
 
 def _work(trainer: Trainer, total_steps: int, progress: bool) -> BaseException | None:

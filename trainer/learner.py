@@ -9,7 +9,7 @@ Shapes: N lanes, T control steps, F demo frames, D frame features, W control ste
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -272,6 +272,7 @@ class Learner:
                 config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
                 nthread=config.rollouts.threads,
             )  # fmt: skip
+            self._wild = _anywhere(self._wild, self.demo_steps - every, config.seed)
         return self._wild
 
     def _make_policy(self) -> Policy:
@@ -302,6 +303,19 @@ class Learner:
             physics=rollouts.physics,
         )
         return Collector(env, seed=seed, stagger=stagger, rules=rules)
+
+
+def _anywhere(rollouts: Transitions, latest: int, seed: int) -> Transitions:
+    """Rollouts whose episodes count from a random moment of the demo, up to ``latest``, instead of from 0.
+
+    A random state has no moment of its own; where clips are paired by time, all of the demo is to be seen.
+    """
+    ended = rollouts.terminated | rollouts.truncated
+    number = np.cumsum(ended, axis=1) - ended  # of the episode in its lane
+    rng = np.random.default_rng([seed, 1])
+    begins = rng.integers(max(1, latest + 1), size=(len(number), int(number.max()) + 1))
+    shift = np.take_along_axis(begins, number, axis=1).astype(np.int32)
+    return replace(rollouts, clock=rollouts.clock + shift, next_clock=rollouts.next_clock + shift)
 
 
 def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:

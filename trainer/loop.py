@@ -66,6 +66,17 @@ class _Stopped(Exception):
     """The thread was told to end before it could begin."""
 
 
+def due_in_round(number: int, rounds: int, total: int) -> int:
+    """Ratings asked for by the end of a round before practice: at least one more in each, at most all.
+
+    Args:
+        number: Of the round, 1, 2, ...
+        rounds: How many there are.
+        total: Ratings in all of them.
+    """
+    return min(total, max(number, round(total * number / rounds)))
+
+
 class Trainer:
     """One run: its thread, its files, its place in the database.
 
@@ -397,11 +408,10 @@ class Trainer:
     def _due(self, learner: Learner) -> int:
         """Ratings that a simulated rater has been asked for by now, in all."""
         ratings = self.config.ratings
-        if (
-            learner.iteration == 0
-        ):  # a round, a fit, the next round: later ones are chosen by what was learned
+        if learner.iteration == 0:
+            # A round, a fit, the next round: later ones are chosen by what was learned.
             done = self._snapshot.number if self._snapshot else 0
-            return round(ratings.pretrain * min(1.0, (done + 1) / ratings.rounds))
+            return due_in_round(done + 1, ratings.rounds, ratings.pretrain)
         span = ratings.online_share * self.config.rollouts.total_steps
         return ratings.pretrain + round(ratings.online * min(1.0, learner.env_steps / span))
 

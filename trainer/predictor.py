@@ -26,7 +26,7 @@ from trainer.store import RatedSegment
 
 CLASSES = 5
 KINDS = {"network": "trainer.network", "metric": "trainer.metric"}
-"""Kind to module; each has ``fit(...)`` as below and ``restore(data, device)``."""
+"""Kind to module; each has ``fit(...)`` as below and ``restore(data, config, device)``."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -69,6 +69,13 @@ def _of_seed(seed: int, ratings: int, steps: int, *, quick: bool) -> list[Job]:
                 jobs.append(
                     method_job(label, seed, method=method, ratings=ratings, steps=steps, changes=values)
                 )
+    if not quick:  # tried for the paper's network; onedemo's distance knows the order of ratings anyway
+        jobs.append(
+            method_job(
+                f"{_PAPER} with an ordinal loss", seed, method=_PAPER, ratings=ratings, steps=steps,
+                changes={"predictor.ordinal": True},
+            )
+        )  # fmt: skip
     return jobs
 
 

@@ -31,6 +31,10 @@ from trainer.predictor import CLASSES, PredictorConfig, Snapshot
 from trainer.raters import Oracle, appearance
 from trainer.records import Demo
 from trainer.timing import steps_of_frames
+from trainer.trpo import TrpoConfig
+
+_TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}
+"""Those that made the built-in demos."""
 
 
 def handcoded(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, Any]:
@@ -45,7 +49,7 @@ def handcoded(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str
     sizes = HandcodedConfig()
     config = HandcodedConfig(
         task=demo.task, steps=settings["steps"], seed=seed, threads=1,
-        evaluate_every=_every(settings["steps"], sizes.lanes * sizes.batch),
+        evaluate_every=_every(settings["steps"], sizes.lanes * sizes.batch), trpo=_TRPO[demo.task],
     )  # fmt: skip
     trained = train_handcoded(config, progress=False)
     return _baseline(demo, trained.final, trained.curve) | {

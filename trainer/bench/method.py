@@ -1,7 +1,8 @@
 """The job behind most tables: one training from ratings, and what came of it.
 
 Settings of a job: ``demo``, ``method``, ``rater``, ``ratings`` (in all), ``steps`` (of practice) and
-``set``, more settings by their dotted names. The result, which the controls have in the same form:
+``set``, more settings by their dotted names; ``config`` is a digest of all that follows from them. The
+result, which the controls have in the same form:
 
 - ``figures``: of the final policy, name to {mean, best, worst, each}, each of 16 episodes;
 - ``curve``: name to means over 16 episodes, at about 12 points of ``env_steps``;
@@ -14,6 +15,7 @@ Shapes: N = 16 episodes, T control steps, q = 6 positions.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,7 +26,7 @@ import numpy as np
 from trainer import envs
 from trainer.appearance import learn as learn_appearance
 from trainer.bench.study import Job
-from trainer.config import RunConfig, load_config
+from trainer.config import RunConfig, load_config, to_toml
 from trainer.demos import find_demo
 from trainer.encoders import demo_features, make_encoder
 from trainer.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
@@ -68,7 +70,13 @@ def method_job(
         "demo": demo, "method": method, "rater": rater, "ratings": ratings, "steps": steps,
         "set": dict(changes or {}),
     }  # fmt: skip
-    return Job(kind="method", label=label, settings=settings, seed=seed)
+    return Job(kind="method", label=label, settings=settings | whole_config(settings), seed=seed)
+
+
+def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
+    """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
+    text = to_toml(run_config({"ratings": 350, "set": {}, **settings}, 0))
+    return {"config": hashlib.sha256(text.encode()).hexdigest()[:10]}
 
 
 def run(

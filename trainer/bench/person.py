@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from trainer.bench import method
+from trainer.bench.method import whole_config
 from trainer.bench.study import Job
 from trainer.demos import import_video
 from trainer.errors import UserError
@@ -56,7 +57,7 @@ def person_job(
     settings = {
         "method": method, "rater": rater, "ratings": ratings, "steps": steps, "set": dict(changes or {}),
     }  # fmt: skip
-    return Job(kind="person", label=label, settings=settings, seed=seed)
+    return Job(kind="person", label=label, settings=settings | whole_config(settings), seed=seed)
 
 
 def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:

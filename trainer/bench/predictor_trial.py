@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from trainer import appearance
+from trainer.bench.method import prepare
 from trainer.bench.predictor_exam import Exam
 from trainer.bench.predictor_scores import (
     calibration_error,
@@ -28,7 +29,7 @@ from trainer.bench.predictor_scores import (
 )
 from trainer.config import load_config
 from trainer.demos import find_demo
-from trainer.encoders import demo_features, make_encoder
+from trainer.encoders import demo_features
 from trainer.hidden import hidden_path, load_hidden
 from trainer.learner import Learner
 from trainer.predictor import CLASSES, Snapshot
@@ -186,7 +187,7 @@ class _Scene:
 
 def _look(demo: Demo, kept: Path) -> _Scene:
     """What onedemo sees of a demo: frame features, and poses in them."""
-    encoder = make_encoder(load_config().encoder)
+    encoder = prepare(demo, load_config(), kept)  # one job at a time
     features = demo_features(demo, encoder, kept / "demos")
     look = appearance.learn(load_config().env, encoder, kept / "robots")
     return _Scene(features=features, track=look.track(features, demo.fps))

@@ -15,6 +15,9 @@ TUNING_FROM = 100
 """Settings are tuned on seeds from here on, which no table reports; reports take 0, 1, 2 and so on."""
 
 
+_MOST_SEEDS = 1000
+
+
 class Table(Protocol):
     """What a module of a table has.
 
@@ -77,7 +80,9 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     numbers = [int(word) if word.isdecimal() else -1 for word in words]
     if "," not in text:
-        numbers = list(range(numbers[0])) if numbers else []
-    if not numbers or min(numbers) < 0 or len(set(numbers)) < len(numbers):
-        raise ValueError(f"must be how many seeds, or a list of different ones such as 3,7,9; got {text!r}")
+        numbers = list(range(min(numbers[0], _MOST_SEEDS + 1))) if numbers else []
+    if len(numbers) > _MOST_SEEDS or not numbers or min(numbers) < 0 or len(set(numbers)) < len(numbers):
+        raise ValueError(
+            f"must be how many seeds, 1 to {_MOST_SEEDS}, or a list of different ones such as 3,7,9; got {text!r}"
+        )
     return tuple(numbers)
