@@ -165,8 +165,8 @@ def state_errors(obs: np.ndarray, demo_obs: np.ndarray) -> np.ndarray:
     """Squared error of the states against the demo's at the same time: the paper's figure 3 (c).
 
     A state is the observation with the torso's angle as in a picture, by sine and cosine: a turn more or
-    less cannot be seen. Each of the 12 numbers is divided by its standard deviation over the demo, at least 0.05; the
-    error is the mean over them, so the demo's own mean state has an error of 1 on average.
+    less cannot be seen. Each of the 12 numbers is divided by its standard deviation over the demo, at least
+    0.05; the error is the mean over them, so the demo's own mean state has an error of 1 on average.
 
     Args:
         obs: Observations, (N, T, o).
