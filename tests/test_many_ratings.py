@@ -73,7 +73,7 @@ def test_no_ratings_are_a_header():
 
 def test_the_data_tab_shows_the_tallies(store):
     _fill(store.path, 0, 500)
-    html = data_html(_RUN, store.tallies(_RUN), "/x/y.sqlite3")
+    html = data_html(_RUN, "onedemo", store.tallies(_RUN), "/x/y.sqlite3")
     assert "500 ratings" in html
     row = '<th scope="row">rater 3</th><td>pretrain</td>'
     cells = store.tallies(_RUN)["rater 3", "pretrain"]

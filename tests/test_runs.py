@@ -123,7 +123,9 @@ def test_a_run_of_before_there_were_methods_is_the_papers(store, tmp_path):
     config = found[1]
     settings = {"seed": 3, "ratings.pretrain": 20, "ratings.online": 15, "trpo.max_kl": 0.02}
     # The trust region stayed what it was.
-    assert config == load_config(None, settings | {"method": "paper", "trpo.final_kl": 0.02})
+    assert config == load_config(
+        None, settings | {"method": "paper", "trpo.final_kl": 0.02, "predictor.visual_dims": 24}
+    )
     with pytest.raises(UserError, match="method is 'paper', not 'onedemo'"):
         find_run(store, tmp_path, DEMO, name=run, wanted=load_config(None, settings))
 

@@ -179,9 +179,11 @@ def test_a_file_of_other_settings_is_not_taken(tmp_path):
 
 
 _PARENT = """
+import signal
 import sys
 from pathlib import Path
 from trainer.bench.study import Job, run_jobs
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 at, results = sys.argv[1:]
 jobs = [Job(kind="tiny:waits", label="wait", settings={"at": at}, seed=seed) for seed in (0, 1)]
 run_jobs(jobs, Path(results), workers=2)
