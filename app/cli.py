@@ -183,7 +183,7 @@ _SETTINGS = ("method", "seed", "device", "encoder")
 
 
 def _config(arguments: argparse.Namespace) -> Any:
-    from trainer.config import load_config, parse_override
+    from trainer.config import load_config, parse_override, split_ratings
 
     overrides = dict(parse_override(text) for text in arguments.settings)
     for key in _SETTINGS:
@@ -193,9 +193,7 @@ def _config(arguments: argparse.Namespace) -> Any:
     if ratings is not None:
         if ratings < 2:
             raise UserError(f"--ratings must be at least 2, got {ratings}")
-        # The paper's split of 350: 200 of a random policy, then 150 online.
-        overrides["ratings.pretrain"] = max(1, round(ratings * 4 / 7))
-        overrides["ratings.online"] = ratings - overrides["ratings.pretrain"]
+        overrides["ratings.pretrain"], overrides["ratings.online"] = split_ratings(ratings)
     if getattr(arguments, "steps", None) is not None:
         overrides["rollouts.total_steps"] = arguments.steps
     return load_config(arguments.config, overrides)

@@ -132,6 +132,12 @@ class RunConfig:
             raise ValueError(f'device must be "cpu", "cuda" or "cuda:N", got {self.device!r}')
 
 
+def split_ratings(total: int) -> tuple[int, int]:
+    """A budget of ratings before practice and during it, in the paper's proportion of 200 to 150."""
+    pretrain = max(1, round(total * 4 / 7))
+    return pretrain, total - pretrain
+
+
 def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> RunConfig:
     """The defaults, changed by a TOML file, changed by overrides.
 

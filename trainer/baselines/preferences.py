@@ -34,6 +34,7 @@ from trainer.baselines.reward_model import (
     most_disputed,
 )
 from trainer.baselines.scores import Score, judge, save_training
+from trainer.config import split_ratings
 from trainer.errors import UserError
 from trainer.hidden import HiddenStates
 from trainer.policy import Policy, PolicyConfig
@@ -212,8 +213,7 @@ def split_comparisons(total: int) -> tuple[int, int]:
     """
     if total < 2:
         raise UserError(f"comparisons must be at least 2, got {total}")
-    pretrain = max(1, round(total * 4 / 7))
-    return pretrain, total - pretrain
+    return split_ratings(total)
 
 
 def comparisons_due(config: PreferencesConfig, steps: int, *, last: int) -> int:

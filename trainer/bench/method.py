@@ -26,7 +26,7 @@ import numpy as np
 from trainer import envs
 from trainer.appearance import learn as learn_appearance
 from trainer.bench.study import Job
-from trainer.config import RunConfig, load_config, to_toml
+from trainer.config import RunConfig, load_config, split_ratings, to_toml
 from trainer.demos import find_demo
 from trainer.encoders import demo_features, make_encoder
 from trainer.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
@@ -130,12 +130,12 @@ def run(
 
 def run_config(settings: Mapping[str, Any], seed: int) -> RunConfig:
     """The settings of the run behind a job: on one core, ratings split as the paper splits its 350."""
-    pretrain = max(1, round(settings["ratings"] * 4 / 7))
+    pretrain, online = split_ratings(settings["ratings"])
     given = {
         "method": settings["method"],
         "seed": seed,
         "ratings.pretrain": pretrain,
-        "ratings.online": settings["ratings"] - pretrain,
+        "ratings.online": online,
         "rollouts.total_steps": settings["steps"],
         "rollouts.threads": 1,
     }
