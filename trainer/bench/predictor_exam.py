@@ -20,7 +20,7 @@ from trainer.hidden import HiddenStates
 from trainer.learner import Learner
 from trainer.practice import fill_bank
 from trainer.predictor import Snapshot
-from trainer.raters import THRESHOLDS, Oracle
+from trainer.raters import Oracle
 from trainer.records import Rollouts, Segment
 from trainer.starts import HeldNoise
 
@@ -74,8 +74,8 @@ class Exam:
         }
         distances = oracle.distance(hidden.qpos[self._shuffled], hidden.qvel[self._shuffled], 0)
         self.truth = {
-            "own": 5.0, "shuffled": float(_true_rating(distances).mean()),
-            "clips": {name: _true_rating(clips.distances).mean() for name, clips in self._clips.items()},
+            "own": 5.0, "shuffled": float(oracle.rating_of(distances).mean()),
+            "clips": {name: oracle.rating_of(clips.distances).mean() for name, clips in self._clips.items()},
         }  # fmt: skip
 
     def figures(self, snapshot: Snapshot) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class Exam:
         return {
             "own": mean(self._steps),
             "shuffled": mean(self._shuffled),
-            "picked": _true_rating(np.array(picked)).mean(),
+            "picked": self._oracle.rating_of(np.array(picked)).mean(),
             "ranks": {name: self._rank(snapshot, clips) for name, clips in self._clips.items()},
         }
 
@@ -164,8 +164,3 @@ class Exam:
             for s, step in zip(segments, demo_steps, strict=True)
         ]
         return _Clips(demo_steps=demo_steps, segments=segments, distances=np.array(distances))
-
-
-def _true_rating(distances: np.ndarray) -> np.ndarray:
-    """The oracle's, 1..5, of distances (n,)."""
-    return 5 - (distances[:, None] > np.array(THRESHOLDS)).sum(axis=-1)
