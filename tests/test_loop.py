@@ -14,9 +14,10 @@ from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 import trainer
 from trainer import envs
 from trainer.appearance import regress
+from trainer.asking import Simulated, due_in_round
 from trainer.headless import train
 from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from trainer.loop import Simulated, Trainer, due_in_round
+from trainer.loop import Trainer
 from trainer.metric import MetricSnapshot
 from trainer.practice import PracticeRules
 from trainer.rollouts import EpisodeRules, evaluate

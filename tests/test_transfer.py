@@ -10,10 +10,11 @@ from worlds import FRAMES, falling_demo, small_config
 from app.cli import main
 from trainer import body
 from trainer.appearance import Track
+from trainer.asking import Simulated
 from trainer.errors import UserError
 from trainer.imagined import track_basis
 from trainer.learner import Learner
-from trainer.loop import Simulated, Trainer
+from trainer.loop import Trainer
 from trainer.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
 from trainer.records import Segment
 from trainer.runs import add_run

@@ -10,13 +10,14 @@ from typing import Any
 
 from tqdm import tqdm
 
+from trainer.asking import Simulated
 from trainer.config import RunConfig
 from trainer.encoders import Encoder
 from trainer.evaluation import summarise
 from trainer.files import hold
 from trainer.hidden import hidden_path, load_hidden
 from trainer.learner import Learner
-from trainer.loop import Simulated, Trainer
+from trainer.loop import Trainer
 from trainer.predictor import Snapshot
 from trainer.raters import Oracle, make_rater
 from trainer.records import Demo

@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ import torch
 
 from trainer.appearance import Track
 from trainer.appearance import learn as learn_appearance
+from trainer.asking import Asking, Simulated
 from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
@@ -33,10 +34,10 @@ from trainer.motion import TASK_REWARDS
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
 from trainer.priority import give_way
-from trainer.records import Clip, Demo, Segment, Status
+from trainer.records import Demo, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Acting, EpisodeRules, Transitions
-from trainer.store import NewClip, Store
+from trainer.store import Store
 from trainer.training_set import TrainingSet
 from trainer.transfer import keep_start, snapshot_file
 
@@ -46,35 +47,10 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
-_FULL = 2 / 3
-"""Share of the queue that waits before it is filled up for people."""
-_MOST_DECLINED = 100
-"""After so many declined clips in a row, a simulated rater is asked again when there are new rollouts."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Simulated:
-    """A rater that answers at once, in the trainer thread. People rate through the store instead."""
-
-    name: str
-    """In the store."""
-    rate: Callable[[Segment, int], int | None]
-    """(segment, demo step) to a rating, 1..5, or None: declined, another clip is asked instead."""
 
 
 class _Stopped(Exception):
     """The thread was told to end before it could begin."""
-
-
-def due_in_round(number: int, rounds: int, total: int) -> int:
-    """Ratings asked for by the end of a round before practice: at least one more in each, at most all.
-
-    Args:
-        number: Of the round, 1, 2, ...
-        rounds: How many there are.
-        total: Ratings in all of them.
-    """
-    return min(total, max(number, round(total * number / rounds)))
 
 
 class Trainer:
@@ -117,13 +93,12 @@ class Trainer:
         self.directory = data_dir / "runs" / run
         self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
         self._learner: Learner | None = None
-        self._clips: ClipMaker | None = None
         self._snapshot: Snapshot | None = None
         self._fitted_event = 0
+        self._asking = Asking(store, run, config, simulated)
         self._training_set = TrainingSet(store, run)
         self._pool: Transitions | None = None
         self._policy: PolicySnapshot | None = None
-        self._declined = 0
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
         self._control = threading.Lock()
@@ -135,7 +110,7 @@ class Trainer:
             method=config.method,
             total_steps=config.rollouts.total_steps,
             pretrain_ratings=config.ratings.pretrain,
-            target_ratings=config.ratings.pretrain + config.ratings.online,
+            target_ratings=self._asking.target,
         )
 
     # What other threads may call
@@ -173,9 +148,9 @@ class Trainer:
         if self._status.phase in ("pretrain", "online") and self._work_s:
             gone = time.monotonic() - self._work_began
             next_clips = max(1.0, self._work_s - gone)
-        ratings = sum(self.store.ratings_by_class(self.run))
-        error = self._status.error or (self._clips.error if self._clips is not None else "")
-        return replace(self._status, ratings=ratings, next_clips_s=next_clips, error=error)
+        clips = self._asking.clips
+        error = self._status.error or (clips.error if clips is not None else "")
+        return replace(self._status, ratings=self._asking.given(), next_clips_s=next_clips, error=error)
 
     def clip_file(self, clip_id: int) -> Path:
         """The animated picture of a clip; it is there once the clip is "ready"."""
@@ -221,7 +196,7 @@ class Trainer:
         learner = self._prepare()
         limit = self.config.rollouts.total_steps
         while not self._stop.is_set():
-            self._ask(learner)
+            self._asking.fill(learner, self._pool, self._snapshot)
             if learner.env_steps >= limit:
                 self._tell("done", "The robot has practised as long as it was told to.")
                 if self._simulated is not None:
@@ -230,7 +205,7 @@ class Trainer:
             elif self._pause.is_set():
                 self._tell("paused", "Practice is paused. Ratings still count.")
                 self._stop.wait(_TICK_S)
-            elif learner.iteration == 0 and self._ratings() < self.config.ratings.pretrain:
+            elif learner.iteration == 0 and self._asking.given() < self.config.ratings.pretrain:
                 self._tell(
                     "pretrain",
                     "So far the robot moves at random. It practises once it has learned from "
@@ -257,7 +232,7 @@ class Trainer:
         self._learner = learner
         self._load_snapshot()
         if self._renderer is not None:
-            self._clips = ClipMaker(
+            self._asking.clips = ClipMaker(
                 self.store,
                 file=self.clip_file,
                 frames=read_frames(self.demo),
@@ -265,12 +240,12 @@ class Trainer:
                 frames_of=learner.frames_of,
                 renderer=self._renderer,
             )
-            self._clips.recover(self.run)
+            self._asking.clips.recover(self.run)
         with ThreadPoolExecutor(1, "look") as beside:
             looking = beside.submit(self._look)
             while not looking.done():
                 if self._simulated is None:
-                    self._ask(learner)  # people rate meanwhile
+                    self._asking.fill(learner, self._pool, self._snapshot)  # people rate meanwhile
                 wait([looking], _TICK_S)
         torch.set_num_threads(1)
         learner.look_at(*looking.result())
@@ -312,7 +287,7 @@ class Trainer:
         torch.save({"learner": learner.state_dict(), "row": row}, buffer)
         write_atomic(self.directory / "checkpoint.pt", buffer.getvalue())
         self.store.add_iteration(self.run, learner.iteration, **row)
-        self._withdraw_stale(learner)
+        self._asking.withdraw_stale(learner.iteration)
         if self._watch is not None:
             self._watch(learner, snapshot)
         self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
@@ -330,95 +305,8 @@ class Trainer:
         snapshot.save(snapshot_file(self.directory, number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
-        waiting = self.store.waiting_clips(self.run)
-        predicted = {c.id: self._predict(self.store.segment(c.id), c.demo_step) for c in waiting}
-        self.store.set_predictions(number, {i: p for i, p in predicted.items() if p is not None})
+        self._asking.predict_waiting(learner, snapshot)
         return True
-
-    def _ask(self, learner: Learner) -> None:
-        """Cuts clips; in place of those that a simulated rater declines it cuts others.
-
-        Raises:
-            UserError: If a simulated rater declines whatever the random policy does.
-        """
-        self._declined = 0
-        while self._ask_missing(learner):
-            if self._declined >= _MOST_DECLINED:
-                if learner.iteration == 0 and self._simulated is not None:
-                    raise UserError(
-                        f"rater {self._simulated.name} declined {self._declined} clips in a row; "
-                        "without ratings there is nothing to learn from"
-                    )
-                return
-
-    def _ask_missing(self, learner: Learner) -> bool:
-        """Cuts as many clips as are missing from the queue, from the newest rollouts; True if some still are.
-
-        A few at a time, because one alone cannot be a mix of kinds (``trainer/choice.py``). While the
-        first iteration runs people go on with random motion, so that nobody waits.
-        """
-        if self._clips is not None:
-            self._clips.retry()
-        if self._pool is None:  # resumed: the first iteration brings them
-            return False
-        # Waiting is read before given, so that a press in between is missing from neither.
-        waiting = [c for s in ("ready", "cut") for c in self.store.waiting_clips(self.run, s)]
-        given, missing = self._ratings(), 0
-        if self._simulated is not None:
-            missing = self._due(learner) - given
-        elif given < self._status.target_ratings:
-            queue = min(self.config.ratings.queue, self._status.target_ratings - given)
-            missing = queue - len(waiting) if len(waiting) <= _FULL * queue else 0
-        if missing <= 0:
-            return False
-        # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
-        seed = [self.config.seed, learner.iteration, self.store.count_clips(self.run)]
-        questions = learner.choose(self._pool, self._snapshot, missing, np.random.default_rng(seed))
-        new = []
-        for question in questions:
-            segment = self._pool.segment(question.lane, question.start, learner.clip_steps)
-            new.append(
-                NewClip(
-                    demo_step=question.demo_step,
-                    segment=segment,
-                    stage="pretrain" if learner.iteration == 0 else "online",
-                    iteration=learner.iteration,
-                    snapshot=self._snapshot.number if self._snapshot else 0,
-                    predicted=self._predict(segment, question.demo_step),
-                )
-            )
-        clips = self.store.add_clips(self.run, new)
-        if self._clips is not None:
-            self._clips.submit(clips)
-        return self._simulated is not None and self._answer(self._simulated, clips, new)
-
-    def _answer(self, simulated: Simulated, clips: list[Clip], cut: list[NewClip]) -> bool:
-        """Has fresh clips rated by the simulated rater; whether it declined any."""
-        rater, declined = self.store.ensure_rater(simulated.name, "simulated"), False
-        for clip, new in zip(clips, cut, strict=True):
-            value = simulated.rate(new.segment, clip.demo_step)
-            if value is not None:
-                self.store.rate(clip.id, rater.id, value, latency_ms=0)
-                self._declined = 0
-                continue
-            self.store.skip(clip.id, rater.id, latency_ms=0)
-            self._declined, declined = self._declined + 1, True
-        return declined
-
-    def _due(self, learner: Learner) -> int:
-        """Ratings that a simulated rater has been asked for by now, in all."""
-        ratings = self.config.ratings
-        if learner.iteration == 0:
-            # A round, a fit, the next round: later ones are chosen by what was learned.
-            done = self._snapshot.number if self._snapshot else 0
-            return due_in_round(done + 1, ratings.rounds, ratings.pretrain)
-        span = ratings.online_share * self.config.rollouts.total_steps
-        return ratings.pretrain + round(ratings.online * min(1.0, learner.env_steps / span))
-
-    def _withdraw_stale(self, learner: Learner) -> None:
-        oldest = max(1, learner.iteration - self.config.ratings.stale_iterations)
-        stale = [c.id for c in self.store.waiting_clips(self.run) if c.iteration < oldest]
-        self.store.set_clip_state(stale, "withdrawn")
 
     def _true_reward(self, rollouts: Transitions) -> dict[str, float]:
         """The hand-coded reward where the demo's task has one: shown, never learned from."""
@@ -430,14 +318,6 @@ class Trainer:
         assert self._learner is not None
         return {"true_reward": float(reward.mean() * self._learner.demo_steps)}
 
-    def _predict(self, segment: Segment, demo_step: int) -> float | None:
-        if self._snapshot is None or self._learner is None:
-            return None
-        return self._learner.predict(self._snapshot, segment, demo_step)
-
-    def _ratings(self) -> int:
-        return sum(self.store.ratings_by_class(self.run))
-
     def _rest_after(self, error: Exception) -> None:
         """Shows a failure and keeps cutting clips, until told to try again or to stop."""
         reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
@@ -447,7 +327,7 @@ class Trainer:
         while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
             try:
                 if self._learner is not None:
-                    self._ask(self._learner)
+                    self._asking.fill(self._learner, self._pool, self._snapshot)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")
