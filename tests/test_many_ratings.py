@@ -39,7 +39,7 @@ def test_the_page_and_a_press_cost_the_same_with_forty_times_the_ratings(store):
     for small, large in zip(before, after, strict=True):
         assert large < 1.2 * small
     # The measure itself: what walks the ratings does grow.
-    assert steps_of(store, store._rows, "SELECT COUNT(*) FROM ratings") > 20_000
+    assert steps_of(store, store.rows, "SELECT COUNT(*) FROM ratings") > 20_000
 
 
 def test_a_csv_takes_no_memory_that_grows_with_it(store):

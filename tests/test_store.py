@@ -54,7 +54,8 @@ def test_a_rating_is_a_row_of_the_documented_view(store, clips, ann):
     assert row == {
         "id": event, "clip_id": clips[0].id, "run": "r", "demo": "d", "rater": "Ann", "value": 4,
         "stage": "pretrain", "iteration": 0, "latency_ms": 812, "snapshot": 3, "predicted": 2.5,
-        "demo_step": 7, "steps": 38,
+        "demo_step": 7, "steps": 38, "repeat": 0, "mark_start": None, "mark_end": None, "choice": "",
+        "score": None, "left_out": 0,
     }  # fmt: skip
 
 
@@ -66,8 +67,8 @@ def test_another_program_reads_the_view(store, clips, ann):
 
 
 def test_durability_settings(store):
-    assert store._rows("PRAGMA journal_mode") == [("wal",)]
-    assert store._rows("PRAGMA synchronous") == [(2,)]  # FULL
+    assert store.rows("PRAGMA journal_mode") == [("wal",)]
+    assert store.rows("PRAGMA synchronous") == [(2,)]  # FULL
 
 
 @pytest.mark.parametrize("value", [0, 6, 2.5, "3", None, True, float("nan")])
@@ -95,7 +96,7 @@ def test_events_cannot_be_changed_or_removed(store, clips, ann):
     store.rate(clips[0].id, ann.id, 4, latency_ms=1)
     for sql in ("UPDATE events SET value = 1", "DELETE FROM events"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store._rows(sql)
+            store.rows(sql)
     assert store.ratings_by_class() == [0, 0, 0, 1, 0]
 
 
@@ -108,7 +109,7 @@ def test_undo_brings_the_clip_back_and_keeps_the_event(store, clips, ann):
         store.undo(clips[0].id, ann.id)
     store.rate(clips[0].id, ann.id, 5, latency_ms=1)
     assert store.ratings_by_class() == [0, 0, 0, 0, 1]
-    assert store._rows("SELECT COUNT(*) FROM events") == [(3,)]
+    assert store.rows("SELECT COUNT(*) FROM events") == [(3,)]
 
 
 def test_a_skipped_clip_does_not_wait_and_is_no_rating(store, clips, ann):
@@ -130,7 +131,7 @@ def test_training_set_as_of_an_event(store, clips, ann):
     assert [r.value for r in store.ratings_as_of("r", as_of=first)] == [4]
     assert [r.value for r in store.ratings_as_of("r", as_of=second)] == [4, 2]
     assert [r.value for r in store.ratings_as_of("r")] == [2]
-    assert store.ratings_as_of("r") == [(second, clips[1].id, 7, 2)]
+    assert store.ratings_as_of("r") == [(second, clips[1].id, 7, 2, None, None)]
     np.testing.assert_array_equal(store.segment(clips[1].id).obs, segment(1).obs)
 
 
@@ -232,5 +233,86 @@ def test_acknowledged_ratings_survive_kill_9(store, ann, tmp_path):
     again = Store(tmp_path)
     kept = [row[1] for row in again.iter_ratings()]
     assert set(acknowledged) <= set(kept) and len(kept) == len(set(kept))
-    assert again._rows("PRAGMA integrity_check") == [("ok",)]
+    assert again.rows("PRAGMA integrity_check") == [("ok",)]
     again.close()
+
+
+def row_of(store):
+    return [dict(zip(RATING_COLUMNS, row, strict=True)) for row in store.iter_ratings()]
+
+
+def test_where_it_goes_wrong_is_kept_with_the_rating(store, clips, ann):
+    store.rate(clips[0].id, ann.id, 2, 900, mark=(0.1, 0.2))
+    (row,) = row_of(store)
+    assert (row["mark_start"], row["mark_end"]) == (0.1, 0.2)
+    (rating,) = store.ratings_as_of("r")
+    assert (rating.value, rating.mark_start, rating.mark_end) == (2, 0.1, 0.2)
+    for mark in ((0.2, 0.2), (0.3, 0.1), (-0.1, 0.1)):
+        with pytest.raises(ValueError, match="stretch of the clip"):
+            store.rate(clips[1].id, ann.id, 2, 900, mark=mark)
+    assert len(row_of(store)) == 1
+
+
+def test_a_reason_may_follow_a_skip(store, clips, ann):
+    store.skip(clips[0].id, ann.id, 900)
+    with pytest.raises(ValueError, match="rated already"):
+        store.skip(clips[0].id, ann.id, 900)
+    store.skip(clips[0].id, ann.id, 900, reason="nothing to see")
+    with pytest.raises(ValueError, match="rated already"):
+        store.skip(clips[0].id, ann.id, 900, reason="again")
+    with pytest.raises(ValueError, match="1 to 200 characters"):
+        store.skip(clips[1].id, ann.id, 900, reason="x" * 201)
+    assert store.rows("SELECT reason FROM events ORDER BY id") == [(None,), ("nothing to see",)]
+    assert [c.id for c in store.waiting_clips("r")] == [clips[1].id, clips[2].id]
+    store.undo(clips[0].id, ann.id)
+    assert len(store.waiting_clips("r")) == 3
+    store.rate(clips[0].id, ann.id, 3, 900)
+    with pytest.raises(ValueError, match="rated already"):
+        store.skip(clips[0].id, ann.id, 900, reason="too late")
+
+
+def test_a_second_opinion_stands_beside_the_first_and_is_not_learned_from(store, clips, ann):
+    first = store.rate(clips[0].id, ann.id, 2, 900)
+    store.rate(clips[0].id, ann.id, 4, 900, repeat=True)
+    with pytest.raises(ValueError, match="rated already"):
+        store.rate(clips[0].id, ann.id, 4, 900, repeat=True)
+    assert [(row["value"], row["repeat"]) for row in row_of(store)] == [(2, 0), (4, 1)]
+    assert [rating.event for rating in store.ratings_as_of("r")] == [first]
+    assert store.ratings_by_class("r") == [0, 1, 0, 0, 0]
+    store.undo(clips[0].id, ann.id, repeat=True)
+    assert [(row["value"], row["repeat"]) for row in row_of(store)] == [(2, 0)]
+    assert [(a.clip, a.kind, a.repeat) for a in store.answered("r")] == [
+        (clips[0].id, "undo", True), (clips[0].id, "rate", False),
+    ]  # fmt: skip
+
+
+def test_a_rater_is_left_out_and_taken_in_again_and_every_event_can_be_gone_back_to(store, clips, ann):
+    bob, ada = store.ensure_rater("Bob", "annotator"), store.ensure_rater("Ada", "researcher")
+    mine = store.rate(clips[0].id, ann.id, 2, 900)
+    his = store.rate(clips[0].id, bob.id, 5, 900)
+    out = store.leave_out("r", bob.id, by=ada.id)
+    assert out == store.last_event() and store.left_out("r") == {bob.id}
+    later = store.rate(clips[1].id, bob.id, 5, 900)
+    back = store.leave_out("r", bob.id, by=ada.id, left_out=False)
+
+    def learned(event=None):
+        return [rating.event for rating in store.ratings_as_of("r", event)]
+
+    assert learned(his) == [mine, his]
+    assert learned(out) == learned(later) == [mine]
+    assert learned(back) == learned() == [mine, his, later]
+    assert store.left_out("r") == set()
+    store.leave_out("r", bob.id, by=ada.id)
+    assert [(row["rater"], row["left_out"]) for row in row_of(store)] == [("Ann", 0), ("Bob", 1), ("Bob", 1)]
+    assert sum(store.ratings_by_class("r")) == 3  # nothing is deleted
+    store.add_run(run="q", demo="d", demo_sha256="00", seed=0, config="", version="0")
+    assert store.left_out("q") == set()
+
+
+def test_who_has_practised(store, clips, ann):
+    bob = store.ensure_rater("Bob", "annotator")
+    assert not store.has_practised(ann.id)
+    store.set_practised(ann.id)
+    assert store.has_practised(ann.id) and not store.has_practised(bob.id)
+    store.skip(clips[0].id, bob.id, 900)
+    assert store.has_practised(bob.id)

@@ -162,6 +162,86 @@ STEPS: tuple[str, ...] = (
             WHERE id = new.clip_id;
     END;
     """,
+    # 3: what else a rater can say: where in the clip it goes wrong, why a clip is skipped, and a second
+    # opinion on the same clip; a rater may be left out of training; a clip knows why it was asked.
+    # The log of events is laid out anew for this, every event and its number as it was.
+    """
+    DROP VIEW ratings;
+    CREATE TABLE events_new (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        clip_id INTEGER REFERENCES clips (id),  -- none: it is about the rater
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        kind TEXT NOT NULL CHECK (kind IN ('rate', 'undo', 'skip', 'leave out', 'take in')),
+        value INTEGER CHECK (value BETWEEN 1 AND 5),
+        repeat INTEGER NOT NULL DEFAULT 0 CHECK (repeat IN (0, 1)),  -- 1: the rater's second opinion
+        mark_start REAL,                -- where it goes wrong, seconds from the start of the clip
+        mark_end REAL,
+        reason TEXT,                    -- of a skip
+        snapshot INTEGER NOT NULL,      -- newest prediction of the clip at that time
+        predicted REAL,
+        latency_ms INTEGER NOT NULL,    -- from the clip on screen to the press
+        run TEXT REFERENCES runs (id),  -- in which a rater is left out or taken in again
+        by_id INTEGER REFERENCES raters (id),  -- who did that
+        created_at TEXT NOT NULL,
+        CHECK ((kind = 'rate') = (value IS NOT NULL)),
+        CHECK ((clip_id IS NULL) = (kind IN ('leave out', 'take in'))),
+        CHECK ((clip_id IS NULL) = (run IS NOT NULL)),
+        CHECK ((mark_start IS NULL) = (mark_end IS NULL)),
+        CHECK (mark_start IS NULL OR (kind = 'rate' AND 0 <= mark_start AND mark_start < mark_end)),
+        CHECK (reason IS NULL OR kind = 'skip')
+    );
+    INSERT INTO events_new (id, clip_id, rater_id, kind, value, snapshot, predicted, latency_ms, created_at)
+        SELECT id, clip_id, rater_id, kind, value, snapshot, predicted, latency_ms, created_at FROM events;
+    DROP TABLE events;
+    ALTER TABLE events_new RENAME TO events;
+    CREATE INDEX events_by_clip ON events (clip_id, rater_id, repeat, id);
+    CREATE INDEX events_about_raters ON events (run, rater_id, id) WHERE clip_id IS NULL;
+    CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
+        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
+    CREATE TRIGGER events_keep_delete BEFORE DELETE ON events
+        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
+    -- As before; second opinions do not count.
+    CREATE TRIGGER events_count AFTER INSERT ON events WHEN new.clip_id IS NOT NULL AND new.repeat = 0 BEGIN
+        UPDATE tallies SET ratings = ratings - 1
+            WHERE (run, stage) = (SELECT run, stage FROM clips WHERE id = new.clip_id)
+            AND rater_id = new.rater_id AND value = (
+                SELECT value FROM events
+                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND repeat = 0 AND id < new.id
+                ORDER BY id DESC LIMIT 1
+            );
+        INSERT INTO tallies
+            SELECT run, new.rater_id, stage, new.value, 1 FROM clips
+            WHERE id = new.clip_id AND new.kind = 'rate'
+            ON CONFLICT DO UPDATE SET ratings = ratings + 1;
+        UPDATE clips SET answers = answers + (new.kind != 'undo') - COALESCE((
+                SELECT kind != 'undo' FROM events
+                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND repeat = 0 AND id < new.id
+                ORDER BY id DESC LIMIT 1
+            ), 0)
+            WHERE id = new.clip_id;
+    END;
+    ALTER TABLE clips ADD COLUMN choice TEXT NOT NULL DEFAULT '';  -- why it is asked; trainer/choice.py
+    ALTER TABLE clips ADD COLUMN score REAL;  -- by what it was chosen
+    ALTER TABLE raters ADD COLUMN practised_at TEXT;  -- when the practice clips were done
+    -- The ratings that hold, one row each; second opinions have repeat 1.
+    CREATE VIEW ratings AS
+        SELECT e.id, e.clip_id, c.run, r.demo, p.name AS rater, e.value, c.stage, c.iteration,
+               e.created_at, e.latency_ms, e.snapshot, e.predicted, c.demo_step, c.steps,
+               e.repeat, e.mark_start, e.mark_end, c.choice, c.score,
+               COALESCE((
+                   SELECT o.kind = 'leave out' FROM events o
+                   WHERE o.clip_id IS NULL AND o.run = c.run AND o.rater_id = e.rater_id
+                   ORDER BY o.id DESC LIMIT 1
+               ), 0) AS left_out
+        FROM events e
+        JOIN clips c ON c.id = e.clip_id
+        JOIN runs r ON r.id = c.run
+        JOIN raters p ON p.id = e.rater_id
+        WHERE e.kind = 'rate' AND NOT EXISTS (
+            SELECT 1 FROM events l
+            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
+        );
+    """,
 )
 
 

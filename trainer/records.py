@@ -125,6 +125,10 @@ class Clip:
     """The rating that snapshot predicted, 1..5."""
     steps: int
     """Length, in control steps."""
+    choice: str = ""
+    """Why it was chosen (``trainer/choice.py``); "" if it was before that was kept."""
+    score: float | None = None
+    """By what it was chosen: a predicted rating, a disagreement; None if by chance."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

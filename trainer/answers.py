@@ -1,0 +1,237 @@
+"""What raters said, in the database: append-only events, and the ratings that hold."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from trainer.database import Database, now
+from trainer.records import Segment
+
+RATING_COLUMNS = (
+    "id", "clip_id", "run", "demo", "rater", "value", "stage", "iteration", "created_at",
+    "latency_ms", "snapshot", "predicted", "demo_step", "steps", "repeat", "mark_start", "mark_end",
+    "choice", "score", "left_out",
+)  # fmt: skip
+"""Columns of the view ``ratings``, in order."""
+MOST_REASON = 200
+"""Characters of the reason for a skip."""
+
+
+class Rating(NamedTuple):
+    """One rating that holds: a row of the training set."""
+
+    event: int
+    clip: int
+    demo_step: int
+    value: int
+    mark_start: float | None
+    """Where it goes wrong, seconds from the start of the clip; None: not said."""
+    mark_end: float | None
+
+
+class Answered(NamedTuple):
+    """The last word of a rater on a clip."""
+
+    clip: int
+    rater: int
+    kind: str
+    """"rate", "skip" or "undo"."""
+    repeat: bool
+    """Whether it is the rater's second opinion."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RatedSegment:
+    """One rating that holds, with what was rated: what a predictor is fitted on."""
+
+    event: int
+    demo_step: int
+    segment: Segment
+    value: int
+
+
+class Answers(Database):
+    """Rating events."""
+
+    def rate(
+        self, clip_id: int, rater_id: int, value: int, latency_ms: int, *,
+        mark: tuple[float, float] | None = None, repeat: bool = False,
+    ) -> int:  # fmt: skip
+        """Commits one rating and returns its event number.
+
+        Args:
+            clip_id: What is rated.
+            rater_id: By whom.
+            value: 1 to 5.
+            latency_ms: From the clip on screen to the press.
+            mark: Where it goes wrong, seconds from the start of the clip.
+            repeat: It is the rater's second opinion, to see how steady the first one was: it is kept
+                beside it, and nothing learns from it.
+
+        Raises:
+            ValueError: If the value is not a whole number from 1 to 5, there is no such clip, the mark
+                does not lie on it, or the rater's rating of this clip holds already.
+        """
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 5:
+            raise ValueError(f"a rating is a whole number from 1 to 5, got {value!r}")
+        return self._event(clip_id, rater_id, "rate", value, latency_ms, mark=mark, repeat=repeat)
+
+    def skip(
+        self, clip_id: int, rater_id: int, latency_ms: int, *, reason: str | None = None, repeat: bool = False
+    ) -> int:
+        """Commits that the rater would not rate this clip; returns the event number.
+
+        The reason may follow later: a skip with a reason takes the place of one without.
+
+        Raises:
+            ValueError: As ``rate``; or the reason is longer than 200 characters.
+        """
+        if reason is not None and not 1 <= len(reason) <= MOST_REASON:
+            raise ValueError(f"a reason is 1 to {MOST_REASON} characters, got {len(reason)}")
+        return self._event(clip_id, rater_id, "skip", None, latency_ms, reason=reason, repeat=repeat)
+
+    def undo(self, clip_id: int, rater_id: int, *, repeat: bool = False) -> int:
+        """Takes a rater's rating or skip of a clip back; returns the event number.
+
+        Raises:
+            ValueError: If there is nothing to take back.
+        """
+        return self._event(clip_id, rater_id, "undo", None, 0, repeat=repeat)
+
+    def _event(
+        self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int, *,
+        mark: tuple[float, float] | None = None, reason: str | None = None, repeat: bool = False,
+    ) -> int:  # fmt: skip
+        with self.transaction() as db:
+            clip = db.execute(
+                "SELECT c.snapshot, c.predicted, (SELECT e.kind || (e.reason IS NOT NULL) FROM events e"
+                "  WHERE e.clip_id = c.id AND e.rater_id = ?1 AND e.repeat = ?2 ORDER BY e.id DESC LIMIT 1)"
+                " FROM clips c WHERE c.id = ?3",
+                (rater_id, repeat, clip_id),
+            ).fetchone()
+            if clip is None:
+                raise ValueError(f"no clip {clip_id}")
+            *predicted, last = clip
+            holds = last is not None and not last.startswith("undo")
+            if kind == "undo" and not holds:
+                raise ValueError(f"clip {clip_id} has nothing to take back")
+            if kind != "undo" and holds and not (reason is not None and last == "skip0"):
+                raise ValueError(f"clip {clip_id} is rated already by this rater")
+            row = {
+                "clip_id": clip_id, "rater_id": rater_id, "kind": kind, "value": value, "repeat": repeat,
+                "mark_start": mark[0] if mark else None, "mark_end": mark[1] if mark else None,
+                "reason": reason, "snapshot": predicted[0], "predicted": predicted[1],
+                "latency_ms": max(0, int(latency_ms)), "created_at": now(),
+            }  # fmt: skip
+            try:
+                cursor = db.execute(
+                    f"INSERT INTO events ({', '.join(row)}) VALUES ({', '.join('?' * len(row))})",
+                    tuple(row.values()),
+                )
+            except sqlite3.IntegrityError:
+                if mark is None:
+                    raise
+                raise ValueError(f"a mark is a stretch of the clip in seconds, got {mark}") from None
+            assert cursor.lastrowid is not None
+            return cursor.lastrowid
+
+    def leave_out(self, run: str, rater_id: int, *, by: int, left_out: bool = True) -> int:
+        """Leaves a rater's ratings of a run out of training from now on, or takes them in again.
+
+        Nothing is deleted. It is an event like a rating, so a snapshot's last event tells who was left out.
+
+        Args:
+            run: Of whose training.
+            rater_id: Whose ratings.
+            by: Who decides.
+            left_out: False takes them in again.
+
+        Returns:
+            The event number.
+        """
+        with self.transaction() as db:
+            cursor = db.execute(
+                "INSERT INTO events (rater_id, kind, run, by_id, snapshot, latency_ms, created_at)"
+                " VALUES (?, ?, ?, ?, 0, 0, ?)",
+                (rater_id, "leave out" if left_out else "take in", run, by, now()),
+            )
+            assert cursor.lastrowid is not None
+            return cursor.lastrowid
+
+    def left_out(self, run: str) -> set[int]:
+        """Raters whose ratings nothing in a run learns from at present."""
+        rows = self.rows(
+            "SELECT rater_id, kind FROM events WHERE clip_id IS NULL AND run = ? ORDER BY id", (run,)
+        )
+        return {rater for rater, kind in dict(rows).items() if kind == "leave out"}
+
+    def answered(self, run: str, most: int = 400) -> list[Answered]:
+        """The last word of each rater on each of the clips of a run that were answered last, newest first.
+
+        Args:
+            run: Of which.
+            most: Events to look back.
+        """
+        rows = self.rows(
+            "SELECT e.clip_id, e.rater_id, e.kind, e.repeat FROM events e JOIN clips c ON c.id = e.clip_id"
+            " WHERE c.run = ? ORDER BY e.id DESC LIMIT ?",
+            (run, most),
+        )
+        last: dict[tuple, Answered] = {}
+        for clip, rater, kind, repeat in rows:
+            last.setdefault((clip, rater, repeat), Answered(clip, rater, kind, bool(repeat)))
+        return list(last.values())
+
+    def last_event(self) -> int:
+        """Number of the newest event of all runs, 0 if there is none."""
+        return self.rows("SELECT MAX(id) FROM events")[0][0] or 0
+
+    def ratings_as_of(self, run: str, as_of: int | None = None) -> list[Rating]:
+        """What was learned from as of event ``as_of`` (default: now): ratings of a run that held, in order.
+
+        Not among them: second opinions, and ratings of raters who were left out.
+
+        The same events give the same list, so a snapshot can be traced to its ratings and made again
+        (``TrainingSet`` adds the segments).
+        """
+        limit = as_of if as_of is not None else 2**62
+        rows = self.stream(
+            "SELECT e.id, e.clip_id, c.demo_step, e.value, e.mark_start, e.mark_end"
+            " FROM events e JOIN clips c ON c.id = e.clip_id"
+            " WHERE c.run = ?1 AND e.kind = 'rate' AND e.repeat = 0 AND e.id <= ?2 AND NOT EXISTS ("
+            "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
+            "  AND l.repeat = 0 AND l.id > e.id AND l.id <= ?2) AND COALESCE(("
+            "  SELECT o.kind FROM events o WHERE o.clip_id IS NULL AND o.run = ?1"
+            "  AND o.rater_id = e.rater_id AND o.id <= ?2 ORDER BY o.id DESC LIMIT 1"
+            " ), '') != 'leave out' ORDER BY e.id",
+            (run, limit),
+        )
+        return [Rating._make(row) for row in rows]
+
+    def ratings_by_class(self, run: str | None = None) -> list[int]:
+        """How many ratings of 1, 2, 3, 4 and 5 hold, in one run or in all."""
+        where, values = ("", ()) if run is None else ("WHERE run = ?", (run,))
+        counts = dict(self.rows(f"SELECT value, SUM(ratings) FROM tallies {where} GROUP BY value", values))
+        return [counts.get(value, 0) for value in range(1, 6)]
+
+    def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
+        """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""
+        rows = self.rows(
+            "SELECT name, stage, value, ratings FROM tallies JOIN raters ON raters.id = rater_id"
+            " WHERE run = ? AND ratings > 0 ORDER BY name, stage",
+            (run,),
+        )
+        counts: dict[tuple[str, str], list[int]] = {}
+        for name, stage, value, ratings in rows:
+            counts.setdefault((name, stage), [0] * 5)[value - 1] = ratings
+        return counts
+
+    def iter_ratings(self, run: str | None = None) -> Iterator[tuple]:
+        """Rows of the view ``ratings`` in order of their number, streamed."""
+        return self.stream(
+            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
+            (run,),
+        )
