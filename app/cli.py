@@ -64,6 +64,17 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (127.0.0.1)")
     serve.add_argument("--port", type=_port, default=8080, help="port of the web page (8080)")
     serve.add_argument("--new-run", action="store_true", help="start over instead of going on")
+    serve.add_argument(
+        "--shared",
+        type=float,
+        default=0.1,
+        metavar="SHARE",
+        help="of clips shown to several people (0.1)",
+    )
+    serve.add_argument(
+        "--repeated", type=float, default=0.04, metavar="SHARE",
+        help="of clips shown to the same person again (0.04)",
+    )  # fmt: skip
 
     train = _command(commands, "train", _train, "the same trainer without a browser, rated by a program")
     _run_options(train)
@@ -200,10 +211,15 @@ def _config(arguments: argparse.Namespace) -> Any:
 
 
 def _serve(arguments: argparse.Namespace) -> None:
+    from app.assignment import Again
     from app.serve import serve
     from trainer.demos import find_demo
 
     config = _config(arguments)
+    try:
+        again = Again(shared=arguments.shared, repeated=arguments.repeated)
+    except ValueError as error:
+        raise UserError(str(error)) from None
     serve(
         data_dir=arguments.data_dir,
         demo=find_demo(arguments.demo, arguments.data_dir / "demos"),
@@ -215,6 +231,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         port=arguments.port,
         run=arguments.run_name,
         new_run=arguments.new_run,
+        again=again,
     )
 
 

@@ -7,16 +7,21 @@ desk moves on; if the commit fails the clip stays.
 
 from __future__ import annotations
 
+import math
+import random
 import threading
 import time
 from collections.abc import Callable, Hashable
 
-from app.assignment import Assignment
+from app.assignment import Ask, Assignment, to_repeat, to_share
 from trainer.records import Rater
 from trainer.store import Store
 
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
+
+Mark = tuple[float, float]
+"""Where a clip goes wrong: from, to, seconds from its start."""
 
 
 class Desk:
@@ -28,7 +33,10 @@ class Desk:
         rater: Who rates.
         assignment: Shared by all pages of the run.
         holder: Names this page to the assignment.
+        dt: Seconds of a control step.
+        done: What was rated or skipped here before, to be taken back: a page that is loaded again goes on.
         clock: Seconds; replaced in tests.
+        rng: Draws which clips are asked again.
     """
 
     def __init__(
@@ -38,36 +46,54 @@ class Desk:
         rater: Rater,
         assignment: Assignment,
         holder: Hashable,
+        *,
+        dt: float,
+        done: list[Ask] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        rng: random.Random | None = None,
     ) -> None:
         self._store = store
         self._run = run
-        self._rater = rater
+        self.rater = rater
         self._assignment = assignment
         self._holder = holder
+        self._dt = dt
         self._clock = clock
+        self._rng = rng or random.Random()
         self._lock = threading.RLock()
-        self._done: list[int] = []
+        self._done = done if done is not None else []
         self._shown_at = 0.0
-        self.current: int | None = None
+        self._current: Ask | None = None
+        self._upcoming: Ask | None = None
+        self.mark: Mark | None = None
+        """Where the clip on screen goes wrong, as far as said."""
+        self.skipped: int | None = None
+        """The clip that was skipped last, as long as its reason may still be said."""
+
+    @property
+    def current(self) -> int | None:
         """The clip on screen, None while there is none."""
-        self.upcoming: int | None = None
+        return self._current.clip if self._current else None
+
+    @property
+    def upcoming(self) -> int | None:
         """The clip after it, to be fetched ahead."""
+        return self._upcoming.clip if self._upcoming else None
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is a rating or a skip of this page to take back."""
+        """Whether there is a rating or a skip to take back."""
         return bool(self._done)
 
     def refill(self) -> bool:
         """Looks for clips if none is on screen or none is at hand; returns whether anything changed."""
         with self._lock:
-            before = self.current, self.upcoming
-            if self.current is None:
+            before = self._current, self._upcoming
+            if self._current is None:
                 self._advance()
-            else:
-                self._look_ahead()
-            return before != (self.current, self.upcoming)
+            elif self._upcoming is None:
+                self._upcoming = self._pick(self._waiting())
+            return before != (self._current, self._upcoming)
 
     def rate(self, clip: int, value: int) -> bool:
         """Commits a rating of the clip that was on screen and moves on.
@@ -79,25 +105,64 @@ class Desk:
             sqlite3.Error: If it could not be committed; the clip stays.
         """
         with self._lock:
-            if not self._accepts(clip):
+            ask = self._accepted(clip)
+            if ask is None:
                 return False
-            self._store.rate(clip, self._rater.id, value, self._latency_ms())
-            self._done.append(clip)
-            self._advance()
+            self._store.rate(
+                clip, self.rater.id, value, self._latency_ms(), mark=self.mark, repeat=ask.repeat
+            )
+            self._leave(ask)
             return True
 
     def skip(self, clip: int) -> bool:
-        """As ``rate``, but without a rating."""
+        """As ``rate``, but without a rating. ``explain`` may follow."""
         with self._lock:
-            if not self._accepts(clip):
+            ask = self._accepted(clip)
+            if ask is None:
                 return False
-            self._store.skip(clip, self._rater.id, self._latency_ms())
-            self._done.append(clip)
-            self._advance()
+            self._store.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
+            self._leave(ask)
+            self.skipped = clip
+            return True
+
+    def explain(self, clip: int, reason: str) -> bool:
+        """Says why the clip skipped last was skipped; False if it is another one.
+
+        Raises:
+            ValueError: If the reason is too long, or cannot be added any more.
+            sqlite3.Error: If it could not be committed.
+        """
+        with self._lock:
+            if clip != self.skipped:
+                return False
+            self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._done[-1].repeat)
+            self.skipped = None
+            return True
+
+    def set_mark(self, clip: int, mark: Mark | None) -> bool:
+        """Notes where the clip on screen goes wrong, or that nothing is said of it; it goes with the rating.
+
+        Returns:
+            False if another clip is on screen.
+
+        Raises:
+            ValueError: If the mark is no stretch of the clip.
+        """
+        with self._lock:
+            if clip != self.current:
+                return False
+            if mark is not None:
+                shown = self._store.clip(clip)
+                length = shown.steps * self._dt if shown is not None else 0.0
+                start, end = max(0.0, mark[0]), min(length, mark[1])
+                if not (start < end and all(map(math.isfinite, mark))):
+                    raise ValueError(f"a mark is a stretch of the clip, 0 to {length:.2f} s, got {mark}")
+                mark = round(start, 3), round(end, 3)
+            self.mark = mark
             return True
 
     def undo(self) -> bool:
-        """Takes the last rating or skip of this page back and shows its clip again.
+        """Takes the last rating or skip back and shows its clip again.
 
         Returns:
             False if there is none.
@@ -108,39 +173,63 @@ class Desk:
         with self._lock:
             if not self._done:
                 return False
-            clip = self._done[-1]
-            self._store.undo(clip, self._rater.id)
+            ask = self._done[-1]
+            self._store.undo(ask.clip, self.rater.id, repeat=ask.repeat)
             self._done.pop()
-            self.upcoming = self.current or self.upcoming
-            self._show(clip)
+            if self._upcoming is not None and self._current is not None:
+                self._assignment.release(self._holder, self._upcoming.clip)
+            self._upcoming = self._current or self._upcoming
+            self._show(ask)
             return True
 
     def close(self) -> None:
         """Frees the clips this page held."""
         self._assignment.release(self._holder)
 
-    def _accepts(self, clip: int) -> bool:
-        return clip == self.current and self._clock() - self._shown_at >= GUARD_SECONDS
+    def _accepted(self, clip: int) -> Ask | None:
+        in_time = self._clock() - self._shown_at >= GUARD_SECONDS
+        return self._current if clip == self.current and in_time else None
 
     def _latency_ms(self) -> int:
         return round(1000 * (self._clock() - self._shown_at))
 
-    def _take(self, count: int) -> list[int]:
-        waiting = [clip.id for clip in self._store.waiting_clips(self._run)]
-        return self._assignment.take(self._holder, waiting, now=self._clock(), avoid=self._done, count=count)
+    def _leave(self, ask: Ask) -> None:
+        self._done.append(ask)
+        self._assignment.release(self._holder, ask.clip)
+        self._advance()
 
     def _advance(self) -> None:
-        clips = self._take(2)
-        self.upcoming = clips[1] if len(clips) > 1 else None
-        self._show(clips[0] if clips else None)
+        waiting = self._waiting()
+        ask, self._current = self._upcoming, None
+        if ask is None or not self._still_asked(ask, waiting):
+            ask = self._pick(waiting)
+        self._show(ask)
+        self._upcoming = self._pick(waiting) if ask is not None else None
 
-    def _look_ahead(self) -> None:
-        if self.upcoming is None:
-            others = [clip for clip in self._take(2) if clip != self.current]
-            self.upcoming = others[0] if others else None
+    def _still_asked(self, ask: Ask, waiting: list[int]) -> bool:
+        """Whether a clip that was fetched ahead may still be shown: others may have taken it since."""
+        return (ask.kind != "fresh" or ask.clip in waiting) and self._take([ask.clip]) is not None
 
-    def _show(self, clip: int | None) -> None:
-        self.current = clip
+    def _pick(self, waiting: list[int]) -> Ask | None:
+        kind = self._assignment.again.draw(self._rng)
+        if kind != "fresh":
+            among = to_share if kind == "shared" else to_repeat
+            clip = self._take(among(self._store.answered(self._run), self.rater.id))
+            if clip is not None:
+                return Ask(clip, kind)
+        clip = self._take(waiting)
+        return Ask(clip) if clip is not None else None
+
+    def _waiting(self) -> list[int]:
+        return [clip.id for clip in self._store.waiting_clips(self._run)]
+
+    def _take(self, clips: list[int]) -> int | None:
+        avoid = () if self._current is None else (self._current.clip,)
+        return self._assignment.take(self._holder, clips, now=self._clock(), avoid=avoid)
+
+    def _show(self, ask: Ask | None) -> None:
+        self._current = ask
+        self.mark = self.skipped = None
         self._shown_at = self._clock()
-        if clip is not None:
-            self._assignment.hold(self._holder, clip, now=self._shown_at)
+        if ask is not None:
+            self._assignment.hold(self._holder, ask.clip, now=self._shown_at)

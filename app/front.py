@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sqlite3
 import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from aiohttp import ClientSession, WSMsgType, web
 
@@ -30,6 +31,7 @@ from trainer.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"
+SESSION_HEADER = "X-Onedemo-Session"
 SCHEME_HEADER = "X-Onedemo-Scheme"
 
 _SESSION_DAYS = 30
@@ -78,6 +80,12 @@ class Inside(Protocol):
     port: int
     secret: str
     pictures: Pictures
+
+    def note(
+        self, rater_id: int, clip: int, *, mark: tuple[float, float] | None = None, reason: str | None = None
+    ) -> bool:
+        """What a browser says of a clip besides its rating."""
+        ...
 
 
 def check_port(host: str, port: int) -> None:
@@ -178,13 +186,14 @@ class Front:
             [
                 web.get("/", self._home),
                 web.get(r"/r/{rater:\d{1,9}}", self._page_of),
+                web.post(r"/r/{rater:\d{1,9}}/note", self._note),
                 web.get("/login", self._log_in),
                 web.get("/healthz", self._health),
                 web.get("/export.csv", self._export),
                 web.get("/static/{name}", self._static),
-                web.get(r"/clips/{clip:\d{1,15}}.webp", self._clip),
+                web.get(r"/clips/{clip:\d{1,15}}.jpg", self._clip),
                 web.get(r"/demo/frames/{index:\d{1,6}}.jpg", self._demo_frame),
-                web.get(r"/demo/examples/{name:[a-z]{1,20}}.webp", self._demo_example),
+                web.get(r"/demo/examples/{name:[a-z]{1,20}}.jpg", self._demo_example),
             ]
         )
         return app
@@ -270,6 +279,20 @@ class Front:
             return await self._socket(request)
         return web.Response(text=self._html, content_type="text/html")
 
+    async def _note(self, request: web.Request) -> web.Response:
+        if not _same_origin(request):
+            raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        try:
+            note = read_note(await request.json())
+            noted = await asyncio.to_thread(partial(self._page.note, request[_RATER].id, **note))
+        except ValueError as error:
+            raise web.HTTPBadRequest(text=f"This could not be noted: {error}.") from None
+        except sqlite3.Error as error:
+            raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
+        if not noted:
+            raise web.HTTPConflict(text="That clip is not on screen any more.")
+        return web.Response(status=204)
+
     async def _health(self, request: web.Request) -> web.Response:
         status = self._trainer.status()
         healthy = status.phase != "failed"
@@ -289,7 +312,7 @@ class Front:
         path = self._trainer.clip_file(number)
         if not path.is_file():
             raise web.HTTPNotFound()
-        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/webp"})
+        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
 
     async def _demo_frame(self, request: web.Request) -> web.StreamResponse:
         frames = await asyncio.to_thread(self._page.pictures.frames)
@@ -303,7 +326,7 @@ class Front:
         example = examples.get(request.match_info["name"])
         if example is None:
             raise web.HTTPNotFound()
-        return web.Response(body=example, content_type="image/webp", headers=_KEEP)
+        return web.Response(body=example, content_type="image/jpeg", headers=_KEEP)
 
     async def _export(self, request: web.Request) -> web.StreamResponse:
         if request[_RATER].role != "researcher":
@@ -335,6 +358,7 @@ class Front:
         identity = {
             RATER_HEADER: str(request[_RATER].id),
             SECRET_HEADER: self._page.secret,
+            SESSION_HEADER: request[_SESSION],
             SCHEME_HEADER: scheme,
         }
         inside = await self._upstream.ws_connect(
@@ -386,6 +410,27 @@ async def _forward(source, target) -> None:
             await target.send_str(message.data)
         else:
             return
+
+
+def read_note(body: Any) -> dict[str, Any]:
+    """What a browser says of a clip: ``{"clip": 7, "mark": [0.1, 0.2] or null}`` or ``{"clip", "reason"}``.
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    if not isinstance(body, dict) or set(body) not in ({"clip", "mark"}, {"clip", "reason"}):
+        raise ValueError("a note has a clip, and a mark or a reason")
+    clip, mark, reason = body["clip"], body.get("mark"), body.get("reason")
+    if type(clip) is not int or not 0 < clip < 2**53:
+        raise ValueError("a clip is a number")
+    if "reason" in body:
+        if not isinstance(reason, str) or not reason.strip() or not reason.isprintable():
+            raise ValueError("a reason is one line of text")
+        return {"clip": clip, "reason": reason.strip()}
+    numbers = mark if isinstance(mark, list) else ()
+    if mark is not None and not (len(numbers) == 2 and all(type(x) in (int, float) for x in numbers)):
+        raise ValueError("a mark is two numbers")
+    return {"clip": clip, "mark": None if mark is None else (float(mark[0]), float(mark[1]))}
 
 
 def _is_public(path: str) -> bool:

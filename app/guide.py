@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from app.words import ANSWERS, MEANINGS
+from app.player import player_html
+from app.words import ANSWERS, MEANINGS, keys_html
 from trainer.records import Status
 
 if TYPE_CHECKING:
     from app.session import Session
 
 log = logging.getLogger("onedemo.page")
-
-_KEYS = (
-    (("1", "2", "3", "4", "5"), "rate the pair; the next one follows at once"),
-    (("U",), "take your last rating back, as often as you like (also Backspace)"),
-    (("S",), "skip this one"),
-    (("Space",), "play it again from the start"),
-)
 
 
 class Guide:
@@ -28,18 +22,25 @@ class Guide:
     title = "Guide"
 
     def __init__(self, session: Session) -> None:
+        self._session = session
         self._pictures = session.page.pictures
-        self._html = session.client.gui.add_html(guide_html(examples=False))
+        self._html = session.client.gui.add_html(guide_html(None))
         self._loading = False
+        self._command: Any = None
 
     def show(self) -> None:
         """Fetches the examples the first time, without making anybody wait."""
         if not self._loading:
             self._loading = True
             threading.Thread(target=self._load, name="onedemo-guide", daemon=True).start()
+        self._command = self._session.client.gui.add_command("Practise again", hotkey="A", modifier="alt")
+        self._command.on_trigger(lambda _: self._session.practise())
 
     def hide(self) -> None:
-        """Nothing to do: it does not change."""
+        """Takes the key away."""
+        if self._command is not None:
+            self._command.remove()
+            self._command = None
 
     def refresh(self, status: Status) -> None:
         """Nothing to do: it does not change."""
@@ -50,22 +51,22 @@ class Guide:
     def _load(self) -> None:
         try:
             self._pictures.examples()
-            self._html.content = guide_html(examples=True)
+            self._html.content = guide_html(self._pictures.demo.fps)
         except Exception:
             log.exception("the examples of the guide could not be made")
 
 
-def guide_html(*, examples: bool) -> str:
-    """The whole tab; while the examples are not made yet it says what the numbers mean."""
+def guide_html(fps: float | None) -> str:
+    """The whole tab.
+
+    Args:
+        fps: Frames per second of the examples; None while they are not made yet.
+    """
     scale = "".join(
         f"<li><b>{value}</b><div><strong>{answer}</strong><span>{meaning}</span></div></li>"
         for value, (answer, meaning) in enumerate(zip(ANSWERS, MEANINGS, strict=True), start=1)
     )
-    keys = "".join(
-        f"<li><span>{''.join(f'<kbd>{key}</kbd>' for key in names)}</span>{text}</li>"
-        for names, text in _KEYS
-    )
-    shown = _examples_html() if examples else _NO_EXAMPLES
+    shown = _examples_html(fps) if fps is not None else _NO_EXAMPLES
     return (
         '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is learning a move from one video. '
         "You see two short movements, about a third of a second each, at real speed: a moment of the video, "
@@ -80,15 +81,16 @@ def guide_html(*, examples: bool) -> str:
         "<li><b>Direction</b>: does it rise, fall and turn the same way?</li>"
         "<li><b>Pace</b>: as fast, as slow?</li></ul>"
         "<p>Ignore the background; how high the robot is counts. Go by your first impression: "
-        "there is no right answer to find, and a second or two is enough.</p></div>"
-        f'<div><h2>Keys</h2><ul class="od-keys">{keys}</ul></div></section></article>'
+        "there is no right answer to find, and a second or two is enough.</p>"
+        '<p><button type="button" class="od-button" data-key="alt+a">Practise again</button></p></div>'
+        f"<div><h2>Keys</h2>{keys_html()}</div></section></article>"
     )
 
 
 _NO_EXAMPLES = '<p class="od-quiet" role="status">The examples are being made…</p>'
 
 
-def _examples_html() -> str:
+def _examples_html(fps: float) -> str:
     captions = {
         "same": ("5", "Twice the same moment."),
         "near": ("4", "Moments that look nearly alike."),
@@ -98,7 +100,7 @@ def _examples_html() -> str:
     cards = ""
     for name, (value, text) in captions.items():
         cards += (
-            f'<figure class="od-example"><div><img src="/demo/examples/{name}.webp" alt=""></div>'
+            f'<figure class="od-example">{player_html(f"/demo/examples/{name}.jpg", fps, "both")}'
             f"<figcaption><b>{value}</b><span>{text}</span></figcaption></figure>"
         )
     return (

@@ -44,7 +44,7 @@ class Pictures:
             return self._frames
 
     def examples(self) -> dict[str, bytes]:
-        """Examples "same", "near", "other" and "far", as WebP: the demo beside itself at growing distance."""
+        """Clips "same", "near", "other" and "far": the demo beside itself at growing distance."""
         with self._lock:
             if self._frames is None:
                 self._prepare()
@@ -57,9 +57,7 @@ class Pictures:
         examples = {}
         for name, other in moments.items():
             start = moments["same"]
-            examples[name] = compose_clip(
-                frames[start : start + length], frames[other : other + length], fps=self.demo.fps
-            )
+            examples[name] = compose_clip(frames[start : start + length], frames[other : other + length])
         self._examples = examples
         self._frames = [_jpeg(frame) for frame in frames]
 

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+from app.assignment import Again
 from app.front import Front, check_port
 from app.links import issue_link, read_secret
 from app.server import Page
@@ -35,6 +36,7 @@ def serve(
     port: int,
     run: str | None,
     new_run: bool,
+    again: Again,
 ) -> None:
     """Serves one run until the process is told to end (Ctrl-C or SIGTERM).
 
@@ -50,6 +52,7 @@ def serve(
         port: Port of the page.
         run: Name of the run to go on with or to make; None: the newest of this demo.
         new_run: Start over even if there is a run of this demo.
+        again: How many clips are asked again.
 
     Raises:
         UserError: If the data directory, the port or the graphics library cannot be used.
@@ -74,7 +77,7 @@ def serve(
             store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
             renderer=renderer,
         )  # fmt: skip
-        page = Page(trainer)
+        page = Page(trainer, again=again)
         front = Front(trainer, page, host=host, port=port)
         ended = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -20,8 +20,9 @@ import viser
 from viser import _messages
 
 from app import data, guide, rate, watch
-from app.assignment import Assignment
-from app.front import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER
+from app.assignment import Again, Ask, Assignment
+from app.desk import Desk, Mark
+from app.front import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from app.live import Live
 from app.pictures import Pictures
 from app.session import Session, TabMaker
@@ -46,14 +47,18 @@ class Page:
     Args:
         trainer: The run that is shown.
         pictures: Of its demo; made from the demo's video if not given.
+        again: How many clips are asked again; the usual shares if not given.
     """
 
-    def __init__(self, trainer: Any, *, pictures: Pictures | None = None) -> None:
+    def __init__(self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None) -> None:
         self.trainer = trainer
         self.secret = secrets.token_urlsafe(32)
         self.pictures = pictures or Pictures(trainer.demo)
-        self.assignment = Assignment()
+        self.assignment = Assignment(again=again or Again())
         self.live = Live(trainer.acting, trainer.demo.seconds)
+        self.desks: dict[int, Desk] = {}
+        """Where people rate, by client."""
+        self._done: dict[str, list[Ask]] = {}
         self._raters: dict[int, Rater] = {}
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -80,6 +85,27 @@ class Page:
         self.live.close()
         self._server.stop()
 
+    def note(self, rater_id: int, clip: int, *, mark: Mark | None = None, reason: str | None = None) -> bool:
+        """What a browser says of a clip besides its rating.
+
+        Args:
+            rater_id: Who says it.
+            clip: Of which clip.
+            mark: Where it goes wrong; None takes that back, unless there is a reason.
+            reason: Why it was skipped.
+
+        Returns:
+            False if no page of the rater has that clip before it.
+
+        Raises:
+            ValueError: As ``Desk.set_mark`` and ``Desk.explain``.
+            sqlite3.Error: If it could not be committed.
+        """
+        for desk in [desk for desk in list(self.desks.values()) if desk.rater.id == rater_id]:
+            if desk.explain(clip, reason) if reason is not None else desk.set_mark(clip, mark):
+                return True
+        return False
+
     # One session per browser
 
     def _connect(self, client: viser.ClientHandle) -> None:
@@ -93,8 +119,9 @@ class Page:
             return
         try:
             session = Session(
-                self, client, rater, dark=headers.get(SCHEME_HEADER) == "dark", makers=tabs_of(rater.role)
-            )
+                self, client, rater, dark=headers.get(SCHEME_HEADER) == "dark",
+                done=self._done.setdefault(headers[SESSION_HEADER], []), makers=tabs_of(rater.role),
+            )  # fmt: skip
         except Exception:
             log.exception("the page of %s could not be built", rater.name)
             hang_up(self._server, client.client_id)

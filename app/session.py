@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
+from app.assignment import Ask
+from app.lesson import Lesson
 from trainer.records import Rater, Status
 
 if TYPE_CHECKING:
@@ -54,6 +56,7 @@ class Session:
         client: The browser.
         rater: Who sits at it.
         dark: Whether the browser prefers dark colours.
+        done: What was rated in this browser before, to be taken back.
         makers: Its tabs, in order.
     """
 
@@ -64,12 +67,16 @@ class Session:
         rater: Rater,
         *,
         dark: bool,
+        done: list[Ask],
         makers: list[TabMaker],
     ) -> None:
         self.page = page
         self.client = client
         self.rater = rater
         self.dark = dark
+        self.done = done
+        self.lesson = None if page.trainer.store.has_practised(rater.id) else Lesson()
+        """The practice clips, until they are done."""
         self._lock = threading.RLock()
         self._closed = False
         self._banner = ""
@@ -109,6 +116,12 @@ class Session:
                 self._header.content = header_html(
                     [tab.title for tab in self._tabs], index, self.page.trainer.demo.name, self.rater
                 )
+
+    def practise(self) -> None:
+        """Shows the practice clips (again)."""
+        with self._lock:
+            self.lesson = Lesson()
+            self.choose([tab.title for tab in self._tabs].index("Rate"))
 
     def refresh(self, status: Status) -> None:
         """Brings counters and states up to date."""

@@ -1,127 +1,216 @@
 // Keys and buttons of the page. Viser carries every press: a button presses its key, and the key is
 // bound on the server to the clip on screen. What this file adds is what only the browser can know:
-// whether a key is being held, whether the clip's picture is there yet, which colours are preferred.
-"use strict";
+// whether a key is being held, whether the clip's picture is there yet, which colours are preferred;
+// and what concerns nobody else, such as slow motion (static/player.js).
+import { main, toggleSlow, watchPlayers } from "./player.js";
 
-(() => {
-  const dark = window.matchMedia("(prefers-color-scheme: dark)");
-  document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
-  dark.addEventListener("change", () => location.reload());
+const dark = window.matchMedia("(prefers-color-scheme: dark)");
+document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
+dark.addEventListener("change", () => location.reload());
 
-  // Viser writes its server into the address bar when the page has a path; here that is always ours.
-  const replaceState = history.replaceState.bind(history);
-  history.replaceState = (state, title) => replaceState(state, title, location.pathname);
+// Viser writes its server into the address bar when the page has a path; here that is always ours.
+const replaceState = history.replaceState.bind(history);
+history.replaceState = (state, title) => replaceState(state, title, location.pathname);
 
-  const shown = (selector) => document.querySelector(selector);
+const shown = (selector) => document.querySelector(selector);
 
-  function typing(target) {
-    return target instanceof Element && target.closest("input, textarea, select, [contenteditable=true]");
-  }
+function typing(target) {
+  return target instanceof Element && target.closest("input, textarea, select, [contenteditable=true]");
+}
 
-  // No rating of a picture that is not there yet.
-  function pictureReady() {
-    const pictures = document.querySelectorAll(".od-side img");
-    return pictures.length > 0 && [...pictures].every((p) => p.complete && p.naturalWidth > 0);
-  }
-
-  function press(combination) {
-    const parts = combination.split("+");
-    const key = parts.pop();
-    const code = /^[0-9]$/.test(key) ? `Digit${key}` : `Key${key.toUpperCase()}`;
-    const alt = parts.includes("alt");
-    document.documentElement.dispatchEvent(
-      new KeyboardEvent("keydown", { key, code, altKey: alt, bubbles: true, cancelable: true }),
-    );
-  }
-
-  function replay() {
-    // The same picture under another name starts from its first frame. It is swapped when it is
-    // there, so that nothing flashes.
-    const pictures = [...document.querySelectorAll(".od-side img")];
-    if (!pictures.length) return;
-    const source = `${pictures[0].src.split("?")[0]}?again=${Date.now()}`;
-    const fresh = new Image();
-    fresh.onload = () => pictures.forEach((p) => p.isConnected && (p.src = source));
-    fresh.src = source;
-  }
-
-  function flash(key) {
-    const button = shown(`.od-answers [data-key="${CSS.escape(key)}"]`);
-    if (!button) return;
-    button.classList.add("od-pressed");
-    setTimeout(() => button.classList.remove("od-pressed"), 180);
-  }
-
-  window.addEventListener(
-    "keydown",
-    (event) => {
-      if (typing(event.target) || event.ctrlKey || event.metaKey) return;
-      if (/^Numpad[1-5]$/.test(event.code) && /^[1-5]$/.test(event.key)) {
-        // Viser's keys are those above the letters.
-        event.stopImmediatePropagation();
-        event.preventDefault();
-        if (!event.repeat) press(event.key);
-        return;
-      }
-      const rating = /^[1-5sS]$/.test(event.key) && !event.altKey;
-      const ours = rating || event.key === "u" || event.key === "U" || event.key === "Backspace";
-      if (ours && (event.repeat || (rating && !pictureReady()))) {
-        event.stopImmediatePropagation();
-        event.preventDefault();
-        return;
-      }
-      if (rating) flash(event.key.toLowerCase());
-      if (event.key === " " && shown(".od-clip")) {
-        // On a button too: the space bar always replays. Enter presses a button.
-        event.preventDefault();
-        event.stopImmediatePropagation();
-        if (!event.repeat) replay();
-      }
-    },
-    true,
+function press(combination) {
+  const parts = combination.split("+");
+  const key = parts.pop();
+  const code = /^[0-9]$/.test(key) ? `Digit${key}` : `Key${key.toUpperCase()}`;
+  const alt = parts.includes("alt");
+  document.documentElement.dispatchEvent(
+    new KeyboardEvent("keydown", { key, code, altKey: alt, bubbles: true, cancelable: true }),
   );
-  window.addEventListener(
-    "keyup",
-    (event) => {
-      if (event.key === " " && shown(".od-clip") && !typing(event.target)) event.preventDefault();
-    },
-    true,
+}
+
+function flash(key) {
+  const button = shown(`.od-answers [data-key="${CSS.escape(key)}"]`);
+  if (!button) return;
+  button.classList.add("od-pressed");
+  setTimeout(() => button.classList.remove("od-pressed"), 180);
+}
+
+// What is said of a clip besides its rating goes another way than presses, and must be there first.
+let noting = null;
+async function note(what) {
+  const answer = await fetch(`${location.pathname}/note`, {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(what),
+  });
+  if (!answer.ok) throw new Error(await answer.text());
+}
+
+function noteMark(player) {
+  if (!player.clip) return;
+  const mark = player.mark && player.mark.map((frame) => frame / player.fps);
+  const mine = note({ clip: player.clip, mark })
+    .catch((error) => {
+      player.setMark(null);
+      player.say(`The mark could not be kept. ${error.message}`);
+    })
+    .finally(() => {
+      if (noting === mine) noting = null;
+    });
+  noting = mine;
+}
+
+function sayWhy(box, reason) {
+  note({ clip: Number(box.dataset.clip), reason }).then(
+    () => (box.textContent = "Noted. Thank you."),
+    (error) => (box.textContent = error.message),
   );
+}
 
-  document.addEventListener("click", (event) => {
-    const button = event.target instanceof Element ? event.target.closest("button") : null;
-    if (!button || button.disabled) return;
-    if (button.dataset.key) press(button.dataset.key);
-    else if ("replay" in button.dataset) replay();
-    else if ("submit" in button.dataset) {
-      // What is on screen is what is rated: slider messages are throttled and may come too late.
-      const thumb = shown(".mantine-Slider-thumb");
-      if (thumb) press(thumb.getAttribute("aria-valuenow"));
+// Keys that concern this browser alone. True if the key was one of them.
+function local(key) {
+  const player = main();
+  if (key === "?") shown(".od-help")?.showModal();
+  else if (!player) return false;
+  else if (key === " ") player.replay();
+  else if (key === "f" || key === "F") toggleSlow();
+  else if (key === "ArrowLeft") player.seek(player.frame - 1);
+  else if (key === "ArrowRight") player.seek(player.frame + 1);
+  else if ((key === "m" || key === "M") && player.clip) {
+    player.markByKey();
+    if (player.marking === null) noteMark(player);
+  } else return false;
+  return true;
+}
+
+window.addEventListener(
+  "keydown",
+  (event) => {
+    if (typing(event.target) || event.ctrlKey || event.metaKey) return;
+    const stop = () => {
+      event.stopImmediatePropagation();
+      event.preventDefault();
+    };
+    if (shown(".od-help[open]")) {
+      // Nobody sees the clip now. Escape, Enter and Tab belong to the dialog.
+      if (event.key === "?") shown(".od-help").close();
+      if (!["Escape", "Enter", "Tab"].includes(event.key)) stop();
+      return;
     }
-  });
-
-  // Viser gives its slider no name.
-  document.addEventListener("focusin", (event) => {
-    if (event.target.matches?.(".mantine-Slider-thumb")) event.target.setAttribute("aria-label", "Rating");
-  });
-
-  // Viser connects only with WebGL. Without it, say so instead of showing an empty page.
-  function webgl() {
-    try {
-      const canvas = document.createElement("canvas");
-      return Boolean(canvas.getContext("webgl2") || canvas.getContext("webgl"));
-    } catch {
-      return false;
+    if (/^Numpad[1-5]$/.test(event.code) && /^[1-5]$/.test(event.key)) {
+      // Viser's keys are those above the letters.
+      stop();
+      if (!event.repeat) press(event.key);
+      return;
     }
+    const arrows = event.key.startsWith("Arrow");
+    if (arrows && event.target.closest?.("[role=slider], [role=tablist]")) return;
+    const rating = /^[1-5sS]$/.test(event.key) && !event.altKey;
+    const ours = rating || event.key === "u" || event.key === "U" || event.key === "Backspace";
+    if (ours && (event.repeat || (rating && !main()?.ready))) return stop(); // no rating of what is not there yet
+    if (rating && noting) {
+      stop();
+      noting.then(() => press(event.key));
+      return;
+    }
+    if (rating) flash(event.key.toLowerCase());
+    if (event.key === "Enter" && shown("[data-go]") && !event.target.closest?.("button, a")) {
+      stop();
+      if (!event.repeat) press("g");
+      return;
+    }
+    // On a button too: the space bar always replays. Enter presses a button.
+    if (!event.altKey && (arrows || !event.repeat ? local(event.key) : event.key === " ")) stop();
+  },
+  true,
+);
+window.addEventListener(
+  "keyup",
+  (event) => {
+    if (event.key === " " && main() && !typing(event.target)) event.preventDefault();
+  },
+  true,
+);
+
+document.addEventListener("click", (event) => {
+  const button = event.target instanceof Element ? event.target.closest("button") : null;
+  if (!button || button.disabled) return;
+  const data = button.dataset;
+  if (data.key) press(data.key);
+  else if ("replay" in data) local(" ");
+  else if ("slow" in data) local("f");
+  else if ("step" in data) local(data.step === "1" ? "ArrowRight" : "ArrowLeft");
+  else if ("mark" in data) local("m");
+  else if ("help" in data) local("?");
+  else if ("unmark" in data) {
+    main()?.setMark(null);
+    if (main()) noteMark(main());
+  } else if ("reason" in data) sayWhy(button.closest(".od-why"), data.reason);
+  else if ("submit" in data) {
+    // What is on screen is what is rated: slider messages are throttled and may come too late.
+    const thumb = shown(".mantine-Slider-thumb");
+    if (thumb) press(thumb.getAttribute("aria-valuenow"));
   }
-  document.addEventListener("DOMContentLoaded", () => {
-    if (webgl()) return;
-    const note = document.createElement("p");
-    note.className = "od-nowebgl";
-    note.setAttribute("role", "alert");
-    note.textContent =
-      "This page needs WebGL, which is switched off in this browser. Please switch on hardware " +
-      "acceleration in its settings, or open the link in another browser.";
-    document.body.append(note);
-  });
-})();
+});
+
+// A reason of one's own, by Enter.
+document.addEventListener("keydown", (event) => {
+  const box = event.target instanceof Element ? event.target.closest(".od-why") : null;
+  if (box && event.key === "Enter" && event.target.value?.trim()) sayWhy(box, event.target.value.trim());
+});
+
+// Marks by dragging over the time bar; a tap shows that moment.
+document.addEventListener("pointerdown", (event) => {
+  const track = event.target instanceof Element ? event.target.closest("[data-track]") : null;
+  const player = track && main();
+  if (!player?.ready) return;
+  event.preventDefault();
+  const box = track.getBoundingClientRect();
+  const at = (e) => Math.max(0, Math.min(player.frames - 1e-6, ((e.clientX - box.left) / box.width) * player.frames));
+  const start = at(event);
+  let dragged = false;
+  const move = (e) => {
+    dragged ||= Math.abs(e.clientX - event.clientX) > 4;
+    player.seek(Math.floor(at(e)));
+    if (!dragged) return;
+    const ends = [start, at(e)].sort((a, b) => a - b);
+    player.setMark([Math.floor(ends[0]), Math.floor(ends[1]) + 1]);
+  };
+  const up = () => {
+    removeEventListener("pointermove", move);
+    removeEventListener("pointerup", up);
+    removeEventListener("pointercancel", up);
+    if (dragged) noteMark(player);
+  };
+  player.seek(Math.floor(start));
+  addEventListener("pointermove", move);
+  addEventListener("pointerup", up);
+  addEventListener("pointercancel", up);
+});
+
+// Viser gives its slider no name.
+document.addEventListener("focusin", (event) => {
+  if (event.target.matches?.(".mantine-Slider-thumb")) event.target.setAttribute("aria-label", "Rating");
+});
+
+watchPlayers();
+
+// Viser connects only with WebGL. Without it, say so instead of showing an empty page.
+function webgl() {
+  try {
+    const canvas = document.createElement("canvas");
+    return Boolean(canvas.getContext("webgl2") || canvas.getContext("webgl"));
+  } catch {
+    return false;
+  }
+}
+document.addEventListener("DOMContentLoaded", () => {
+  if (webgl()) return;
+  const note = document.createElement("p");
+  note.className = "od-nowebgl";
+  note.setAttribute("role", "alert");
+  note.textContent =
+    "This page needs WebGL, which is switched off in this browser. Please switch on hardware " +
+    "acceleration in its settings, or open the link in another browser.";
+  document.body.append(note);
+});

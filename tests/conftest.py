@@ -91,19 +91,25 @@ def site(tmp_path: Path) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     from standin import StandIn
 
+    from app.assignment import Again
     from app.front import Front
     from app.links import issue_link, read_secret
     from app.pictures import Pictures
     from app.server import Page
 
     trainer = StandIn(tmp_path)
-    page = Page(trainer, pictures=Pictures(trainer.demo, read=lambda _: trainer.frames))
+    page = Page(
+        trainer,
+        pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
+        again=Again(shared=0, repeated=0),
+    )
     front = Front(trainer, page, port=0)
     url = front.start()
     site = Site(trainer, page, front, url)
     secret = read_secret(tmp_path)
     for title, name in (("researcher", "ada"), ("annotator", "bo"), ("second annotator", "cy")):
         rater = trainer.store.ensure_rater(name, title.split()[-1])
+        trainer.store.set_practised(rater.id)
         site.links[title] = issue_link(trainer.store, secret, rater, url)
     yield site
     front.close()

@@ -85,8 +85,8 @@ class StandIn:
         ids = [clip.id for clip in self.store.add_clips(self.run, new)]
         for number in ids:
             start = number * 9 % 200
-            webp = compose_clip(self.frames[start : start + 10], drawn_frames(10, phase=number), fps=FPS)
-            self.clip_file(number).write_bytes(webp)
+            picture = compose_clip(self.frames[start : start + 10], drawn_frames(10, phase=number))
+            self.clip_file(number).write_bytes(picture)
         self.store.set_clip_state(ids, "ready")
         return ids
 
@@ -98,8 +98,10 @@ class StandIn:
         with self._lock:
             return self._status
 
+    dt = 0.008
+
     def clip_file(self, clip_id: int) -> Path:
-        return self.directory / f"{clip_id:06d}.webp"
+        return self.directory / f"{clip_id:06d}.jpg"
 
     def acting(self) -> Acting:
         return Acting(policy=Wobble(), rules=EpisodeRules())  # type: ignore[arg-type]

@@ -2,39 +2,70 @@
 
 from __future__ import annotations
 
+import random
 import sqlite3
 
 import numpy as np
 import pytest
 
-from app.assignment import Assignment, Lease, choose
+from app.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
 from app.desk import Desk
+from trainer.answers import Answered
 from trainer.records import Segment
 from trainer.store import NewClip, Store
 
 
-def test_oldest_free_clip_first():
-    leases = {1: Lease("a", 100.0)}
-    assert choose([1, 2, 3], leases, holder="b", now=0.0) == [2, 3]
-    assert choose([1, 2, 3], leases, holder="a", now=0.0) == [1, 2]
-    assert choose([1, 2, 3], leases, holder="b", now=0.0, avoid={2}, count=1) == [3]
-    assert choose([], leases, holder="b", now=0.0) == []
+def test_the_first_free_clip_is_leased_and_stays_with_its_page():
+    assignment = Assignment()
+    assert assignment.take("a", [1, 2, 3], now=0.0) == 1
+    assert assignment.take("b", [1, 2, 3], now=0.0) == 2
+    assert assignment.take("a", [1, 2, 3], now=0.0) == 1
+    assert assignment.take("a", [1, 2, 3], now=0.0, avoid=(1,)) == 3
+    assert assignment.take("c", [1, 2, 3], now=0.0) is None
+    assignment.release("a", 3)
+    assert assignment.take("c", [1, 2, 3], now=0.0) == 3
+    assert assignment.take("c", [], now=0.0) is None
 
 
 def test_lease_ends_after_two_minutes_or_with_the_page():
     assignment = Assignment()
-    assert assignment.take("a", [1, 2], now=0.0) == [1, 2]
-    assert assignment.take("b", [1, 2], now=119.0) == []
-    assert assignment.take("b", [1, 2], now=120.0) == [1, 2]
+    assert assignment.take("a", [1], now=0.0) == 1
+    assert assignment.take("b", [1], now=119.0) is None
+    assert assignment.take("b", [1], now=120.0) == 1
     assignment.release("b")
-    assert assignment.take("c", [1, 2], now=121.0) == [1, 2]
+    assert assignment.take("c", [1], now=121.0) == 1
 
 
 def test_asking_again_does_not_lengthen_a_lease():
     assignment = Assignment()
     assignment.take("a", [1], now=0.0)
     assignment.take("a", [1], now=100.0)
-    assert assignment.take("b", [1], now=121.0) == [1]
+    assert assignment.take("b", [1], now=121.0) == 1
+
+
+def test_shared_are_clips_of_others_with_the_fewest_raters_first():
+    answers = [Answered(4, 1, "skip", False)]
+    answers += [Answered(1, rater, "rate", False) for rater in (2, 3, 4)]  # enough people
+    answers += [Answered(2, rater, "rate", False) for rater in (2, 3)]
+    answers += [Answered(3, 2, "rate", False), Answered(4, 2, "rate", False), Answered(5, 2, "skip", False)]
+    answers += [Answered(6, 1, "rate", False), Answered(7, 2, "rate", False), Answered(7, 1, "undo", False)]
+    assert to_share(answers, 1) == [3, 7, 2]
+    assert to_share(answers, 5) == [3, 4, 6, 7, 2]
+
+
+def test_repeated_are_own_clips_of_some_time_ago_once():
+    mine = [Answered(clip, 1, "rate", False) for clip in range(20, 0, -1)]  # newest first
+    assert to_repeat(mine, 1) == [1, 2, 3, 4, 5]
+    assert to_repeat(mine, 2) == []
+    mine[-1] = Answered(1, 1, "skip", False)
+    assert to_repeat([Answered(2, 1, "rate", True), *mine], 1) == [3, 4, 5]
+    assert to_repeat(mine[:REPEAT_AFTER], 1) == []
+
+
+@pytest.mark.parametrize("share", [-0.1, 0.6, float("nan")])
+def test_shares_are_shares(share):
+    with pytest.raises(ValueError, match=r"0\.\.0\.5"):
+        Again(shared=share)
 
 
 @pytest.fixture
@@ -66,9 +97,15 @@ def clock():
     return Clock()
 
 
+def make_desk(store, clock, name="bo", assignment=None, **more):
+    assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
+    rater = store.ensure_rater(name, "annotator")
+    return Desk(store, "r", rater, assignment, name, dt=0.01, clock=clock, **more)
+
+
 @pytest.fixture
 def desk(store, clock):
-    desk = Desk(store, "r", store.ensure_rater("bo", "annotator"), Assignment(), "page", clock)
+    desk = make_desk(store, clock)
     add_clips(store, 3)
     desk.refill()
     return desk
@@ -117,7 +154,7 @@ def test_skip_moves_on_without_a_rating(desk, store, clock):
 
 
 def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise sqlite3.OperationalError("disk is full")
 
     clock.now += 1
@@ -130,7 +167,7 @@ def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatc
 
 
 def test_waiting_desk_takes_clips_when_they_come(store, clock):
-    desk = Desk(store, "r", store.ensure_rater("bo", "annotator"), Assignment(), "page", clock)
+    desk = make_desk(store, clock)
     assert not desk.refill()
     assert desk.current is None
     first, second = add_clips(store, 2)
@@ -139,11 +176,8 @@ def test_waiting_desk_takes_clips_when_they_come(store, clock):
 
 
 def test_two_raters_never_see_the_same_clip(store, clock):
-    assignment = Assignment()
-    desks = [
-        Desk(store, "r", store.ensure_rater(name, "annotator"), assignment, name, clock)
-        for name in ("bo", "cy")
-    ]
+    assignment = Assignment(again=Again(shared=0, repeated=0))
+    desks = [make_desk(store, clock, name, assignment) for name in ("bo", "cy")]
     add_clips(store, 6)
     seen = []
     for _ in range(3):
@@ -154,3 +188,101 @@ def test_two_raters_never_see_the_same_clip(store, clock):
             desk.rate(desk.current, 1)
     assert sorted(seen) == sorted(set(seen))
     desks[0].close()
+
+
+def test_a_mark_goes_with_the_rating_of_its_clip_alone(desk, store, clock):
+    clock.now += 1
+    assert not desk.set_mark(2, (0.0, 0.01))  # not on screen
+    assert desk.set_mark(1, (-1.0, 0.02)) and desk.mark == (0.0, 0.02)
+    for mark in ((0.02, 0.01), (0.03, 9.0), (float("nan"), 0.01), (0.0, float("nan"))):
+        with pytest.raises(ValueError, match=r"0 to 0\.03 s"):  # three steps of a hundredth
+            desk.set_mark(1, mark)
+    assert desk.mark == (0.0, 0.02)
+    desk.rate(1, 2)
+    clock.now += 1
+    desk.set_mark(2, (0.01, 9.0))
+    desk.set_mark(2, None)
+    desk.rate(2, 3)
+    assert [row[15:17] for row in store.iter_ratings()] == [(0.0, 0.02), (None, None)]
+
+
+def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clock):
+    clock.now += 1
+    desk.skip(1)
+    assert not desk.explain(2, "dark") and desk.explain(1, "dark") and not desk.explain(1, "again")
+    clock.now += 1
+    desk.skip(2)
+    clock.now += 1
+    desk.rate(3, 3)
+    assert not desk.explain(2, "too late")
+    assert store.rows("SELECT clip_id, reason FROM events WHERE kind = 'skip' ORDER BY id") == [
+        (1, None), (1, "dark"), (2, None),
+    ]  # fmt: skip
+
+
+def test_a_page_that_is_loaded_again_can_take_back_what_was_rated_before(store, clock):
+    add_clips(store, 3)
+    done = []
+    first = make_desk(store, clock, done=done)
+    first.refill()
+    clock.now += 1
+    first.rate(1, 5)
+    first.close()
+    again = make_desk(store, clock, done=done)
+    again.refill()
+    assert again.current == 2 and again.undo() and again.current == 1 and not again.can_undo
+
+
+class Always:
+    """Draws one kind."""
+
+    def __init__(self, kind):
+        self.kind = kind
+
+    def choices(self, kinds, weights):
+        return [self.kind]
+
+
+def test_a_shared_clip_is_rated_by_the_second_person_too_and_both_count(store, clock):
+    assignment = Assignment()
+    add_clips(store, 3)
+    bo = make_desk(store, clock, "bo", assignment, rng=Always("fresh"))
+    bo.refill()
+    clock.now += 1
+    bo.rate(1, 4)
+    cy = make_desk(store, clock, "cy", assignment, rng=Always("shared"))
+    cy.refill()
+    assert cy.current == 1
+    clock.now += 1
+    assert cy.rate(1, 5)
+    assert [(row[1], row[4], row[5]) for row in store.iter_ratings()] == [(1, "bo", 4), (1, "cy", 5)]
+    assert [rating.value for rating in store.ratings_as_of("r")] == [4, 5]
+    assert cy.current is None  # bo holds the other two, and nothing else is shared
+
+
+def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
+    add_clips(store, REPEAT_AFTER + 3)
+    rng = Always("fresh")
+    desk = make_desk(store, clock, assignment=Assignment(), rng=rng)
+    desk.refill()
+    for _ in range(REPEAT_AFTER + 1):
+        rng.kind = "repeated"  # too early, but once
+        clock.now += 1
+        desk.rate(desk.current, 4)
+    assert desk.current == REPEAT_AFTER + 2 and desk.upcoming == 1
+    clock.now += 1
+    desk.rate(desk.current, 4)
+    assert desk.current == 1
+    clock.now += 1
+    assert desk.rate(1, 2)
+    rows = [(row[1], row[5], row[14]) for row in store.iter_ratings()]
+    assert rows[0] == (1, 4, 0) and rows[-1] == (1, 2, 1)
+    assert desk.undo() and desk.current == 1
+    assert [(row[1], row[5], row[14]) for row in store.iter_ratings()] == rows[:-1]
+
+
+def test_shares_of_what_is_asked_again_are_as_set():
+    rng = random.Random(1)
+    kinds = [Again(shared=0.1, repeated=0.05).draw(rng) for _ in range(20_000)]
+    assert kinds.count("shared") / kinds.count("fresh") == pytest.approx(0.1, abs=0.01)
+    assert kinds.count("repeated") / kinds.count("fresh") == pytest.approx(0.05, abs=0.01)

@@ -63,7 +63,7 @@ def connect(url, *, link=None, headers=None, path=None):
 
 @pytest.mark.parametrize(
     "path",
-    ["/", "/clips/1.webp", "/demo/frames/0.jpg", "/export.csv", "/static/page.css", "/static/page.js", "/x"],
+    ["/", "/clips/1.jpg", "/demo/frames/0.jpg", "/export.csv", "/static/page.css", "/static/page.js", "/x"],
 )
 def test_nothing_without_a_session(site, path):
     status, headers, body, _ = fetch(site.url, path)
@@ -105,19 +105,19 @@ def test_unknown_and_revoked_links_are_refused_kindly(site):
 
 def test_clips_of_the_run_and_nothing_else(site):
     link = site.links["annotator"]
-    status, headers, body, _ = fetch(site.url, "/clips/1.webp", link=link)
-    assert (status, headers["Content-Type"], body[:4]) == (200, "image/webp", b"RIFF")
+    status, headers, body, _ = fetch(site.url, "/clips/1.jpg", link=link)
+    assert (status, headers["Content-Type"], body[:4]) == (200, "image/jpeg", b"\xff\xd8\xff\xe0")
     assert headers["Cache-Control"] == "private, max-age=31536000, immutable"
     assert headers["X-Content-Type-Options"] == "nosniff"
     for path in (
-        "/clips/999.webp",
+        "/clips/999.jpg",
         "/clips/../page.css",
         "/static/..%2fpyproject.toml",
         "/demo/frames/999.jpg",
     ):
         assert fetch(site.url, path, link=link)[0] == 404, path
     assert fetch(site.url, "/demo/frames/3.jpg", link=link)[2][:2] == b"\xff\xd8"
-    assert fetch(site.url, "/demo/examples/far.webp", link=link)[2][:4] == b"RIFF"
+    assert fetch(site.url, "/demo/examples/far.jpg", link=link)[2][:4] == b"\xff\xd8\xff\xe0"
 
 
 def test_export_is_for_researchers(site):

@@ -32,18 +32,24 @@ def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[An
 
 
 def shown_clip(page) -> int:
-    """The clip on screen, its picture loaded, old enough to be rated."""
-    page.wait_for_selector(".od-clip", timeout=90_000)
-    page.wait_for_function(
-        "() => { const p = [...document.querySelectorAll('.od-side img')];"
-        " return p.length === 2 && p.every(i => i.complete && i.naturalWidth > 0) }"
-    )
+    """The clip on screen, its picture drawn, old enough to be rated."""
+    page.wait_for_selector(".od-clip .od-player[data-clip][data-frame]", timeout=90_000)
     page.wait_for_timeout(GUARD_MS)
-    clip = int(page.locator(".od-clip").get_attribute("data-clip"))
-    assert (
-        page.locator(".od-left img").evaluate("i => new URL(i.currentSrc).pathname") == f"/clips/{clip}.webp"
-    )
+    player = page.locator(".od-clip .od-player")
+    clip = int(player.get_attribute("data-clip"))
+    assert player.get_attribute("data-src") == f"/clips/{clip}.jpg"
+    assert len(set(drawn(page, "left"))) > 2
     return clip
+
+
+def drawn(page, side: str) -> list[int]:
+    """A row of what a side of the clip shows, as grey values."""
+    return page.evaluate(
+        "side => { const c = document.querySelector(`.od-clip canvas[data-side=${side}]`);"
+        " const row = c.getContext('2d').getImageData(0, 190, c.width, 1).data;"
+        " return [...row].filter((_, i) => i % 4 === 0) }",
+        side,
+    )
 
 
 def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
@@ -58,11 +64,13 @@ def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
 def press_and_wait(page, site, act: Callable[[], Any]) -> tuple:
     """Does something that rates, waits until another clip or none is on screen, returns the new event."""
     before = len(site.events())
-    clip = page.locator(".od-clip").get_attribute("data-clip")
+    clip = page.locator(".od-clip .od-player").get_attribute("data-clip")
     act()
     event = until(lambda: site.events()[before:])[0]
     page.wait_for_function(
-        "clip => document.querySelector('.od-clip')?.dataset.clip !== clip", arg=clip, timeout=10_000
+        "clip => document.querySelector('.od-clip .od-player')?.dataset.clip !== clip",
+        arg=clip,
+        timeout=10_000,
     )
     return event
 
@@ -134,7 +142,7 @@ def test_no_tab_is_wider_than_the_screen(chromium, site, viewport):
         for tab, content in (
             ("Rate", ".od-clip"),
             ("Data", ".od-data"),
-            ("Guide", ".od-example img"),
+            ("Guide", ".od-example [data-frame]"),
             ("Watch", ".od-strip"),
         ):
             page.click(f'.od-tabs >> text="{tab}"')
@@ -167,7 +175,7 @@ def test_undo_and_skip(chromium, site):
         press_and_wait(page, site, lambda: page.keyboard.press("s"))
         shown_clip(page)
         assert press_and_wait(page, site, lambda: page.keyboard.press("u")) == ("undo", second, None, "bo")
-        page.wait_for_selector(f'.od-clip[data-clip="{second}"]')
+        page.wait_for_selector(f'.od-clip .od-player[data-clip="{second}"]')
         assert press_and_wait(page, site, lambda: page.keyboard.press("Backspace")) == (
             "undo",
             first,
@@ -183,7 +191,7 @@ def test_keys_do_nothing_on_another_tab(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         shown_clip(page)
         page.click('.od-tabs >> text="Guide"')
-        page.wait_for_selector(".od-example img")
+        page.wait_for_selector(".od-example [data-frame]")
         for key in ("1", "s", "u"):
             page.keyboard.press(key)
         page.wait_for_timeout(300)
@@ -201,11 +209,13 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         clip = shown_clip(page)
         with monkeypatch.context() as patch:
             patch.setattr(
-                store, "rate", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full"))
+                store,
+                "rate",
+                lambda *_, **__: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")),
             )
             page.keyboard.press("3")
             page.wait_for_selector(".od-problem >> text=disk is full")
-            assert page.locator(".od-clip").get_attribute("data-clip") == str(clip)
+            assert page.locator(".od-clip .od-player").get_attribute("data-clip") == str(clip)
         site.trainer.set_status(phase="failed", error="The graphics memory is full.")
         page.wait_for_selector(".od-banner >> text=The graphics memory is full.")
         page.wait_for_timeout(GUARD_MS)

@@ -78,7 +78,7 @@ class ClipMaker:
             )
             agent = renderer.render(segment.qpos[first])
             demo = self._frames[index]
-            write_atomic(self._file(clip.id), compose_clip(demo, agent, fps=self._fps))
+            write_atomic(self._file(clip.id), compose_clip(demo, agent))
             self._store.set_clip_state([clip.id], "ready")
             self.error = ""
         except Exception as error:

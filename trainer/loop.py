@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from trainer import envs
 from trainer.appearance import Track
 from trainer.appearance import learn as learn_appearance
 from trainer.asking import Asking, Simulated
@@ -152,9 +153,14 @@ class Trainer:
         error = self._status.error or (clips.error if clips is not None else "")
         return replace(self._status, ratings=self._asking.given(), next_clips_s=next_clips, error=error)
 
+    @property
+    def dt(self) -> float:
+        """Seconds of a control step."""
+        return envs.spec(self.config.env).dt
+
     def clip_file(self, clip_id: int) -> Path:
-        """The animated picture of a clip; it is there once the clip is "ready"."""
-        return self.directory / "clips" / f"{clip_id:06d}.webp"
+        """The picture of a clip, all its frames; it is there once the clip is "ready"."""
+        return self.directory / "clips" / f"{clip_id:06d}.jpg"
 
     def acting(self) -> Acting | None:
         """The newest policy beside the demo as the newest snapshot moves it; None until there is a policy.

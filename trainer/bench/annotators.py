@@ -22,7 +22,7 @@ import msgspec
 import zstandard
 
 _CLIP = re.compile(r'data-clip="(\d+)"')
-_AHEAD = re.compile(r'od-ahead" src="/clips/(\d+)\.webp')
+_AHEAD = re.compile(r'data-ahead="/clips/(\d+)\.jpg"')
 _WAITING = 'class="od-waiting"'
 _SIZES = 16
 """Bytes before the compressed part of a message: its size when unpacked, and as it is."""
@@ -174,7 +174,7 @@ class Tab:
             self.clip, self.waiting = None, True
 
     async def _fetch(self, clip: int) -> None:
-        async with self.session.get(f"{self.base}/clips/{clip}.webp", headers=self.headers) as answer:
+        async with self.session.get(f"{self.base}/clips/{clip}.jpg", headers=self.headers) as answer:
             answer.raise_for_status()
             await answer.read()
 

@@ -120,7 +120,7 @@ class Supply:
         ]
         self._left = [clip.id for clip in store.add_clips(self._run, new)]
         for clip, original in zip(self._left, originals, strict=True):
-            os.link(pictures / f"{original.id:06d}.webp", pictures / f"{clip:06d}.webp")
+            os.link(pictures / f"{original.id:06d}.jpg", pictures / f"{clip:06d}.jpg")
 
     def fill(self, queue: int) -> None:
         """Lets so many clips wait to be rated.
