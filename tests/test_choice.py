@@ -197,3 +197,32 @@ def test_the_same_generator_asks_the_same():
         for seed in (3, 3, 4)
     )
     assert one == two != other
+
+
+@pytest.mark.parametrize(("how", "score"), [("high", "rating"), ("disagreement", "doubt")])
+def test_one_reason_alone_and_each_clip_knows_why(how, score):
+    clock = np.tile(np.arange(400), (100, 1))
+    told = {"rating": lambda lanes: 1.0 + lanes / 25, "doubt": lambda lanes: 1.0 - lanes / 100}
+
+    def judge(lanes, starts, demo):
+        return told["rating"](lanes), told["doubt"](lanes)
+
+    chosen = choose(
+        rollouts(clock), 12, 38, 400, np.random.default_rng(0), any_time=True, how=how, judge=judge
+    )
+    lanes = np.array([q.lane for q in chosen])
+    assert {q.choice for q in chosen} == {how}
+    assert [q.score for q in chosen] == told[score](lanes).tolist()
+    assert (lanes > 80).all() if how == "high" else (lanes < 20).all()
+
+
+def test_a_mix_says_of_each_clip_which_part_it_is_and_chance_has_no_score():
+    clock = np.tile(np.arange(400), (100, 1))
+    chosen = choose(
+        rollouts(clock), 10, 38, 400, np.random.default_rng(0), any_time=True,
+        judge=lambda lanes, starts, demo: (1.0 + lanes / 50, lanes / 100),
+    )  # fmt: skip
+    assert [q.choice for q in chosen] == ["high"] * 4 + ["disagreement"] * 3 + ["any"] * 3
+    assert all((q.score is None) == (q.choice == "any") for q in chosen)
+    plain = choose(rollouts(clock), 10, 38, 400, np.random.default_rng(0), how="uniform", judge=None)
+    assert {(q.choice, q.score) for q in plain} == {("any", None)}

@@ -136,6 +136,8 @@ class Asking:
                     iteration=learner.iteration,
                     snapshot=snapshot.number if snapshot else 0,
                     predicted=predicted,
+                    choice=question.choice,
+                    score=question.score,
                 )
             )
         clips = self._store.add_clips(self._run, new)

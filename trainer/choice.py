@@ -16,8 +16,13 @@ Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndar
 """(lanes, starts, demo_steps), (n,) each, to predicted ratings and the disagreement on them, (n,) each."""
 
 _CANDIDATES = 3000
-_SHARES = (0.4, 0.3, 0.3)
-"""Of a round: rated highest, most disagreed on, any."""
+CHOICES: dict[str, dict[str, float]] = {
+    "uniform": {"any": 1.0},
+    "mix": {"high": 0.4, "disagreement": 0.3, "any": 0.3},
+    "high": {"high": 1.0},
+    "disagreement": {"disagreement": 1.0},
+}
+"""Ways to choose a round: the shares of clips rated highest, of those most disagreed on, and of any."""
 _APART = 15
 """Control steps of the demo within which ..."""
 _MOST_THERE = 2
@@ -31,6 +36,10 @@ class Question:
     lane: int
     start: int
     demo_step: int
+    choice: str = "any"
+    """Why: "high", "disagreement" or "any"."""
+    score: float | None = None
+    """The predicted rating or the disagreement that it was chosen by."""
 
 
 def choose(
@@ -41,14 +50,15 @@ def choose(
     rng: np.random.Generator,
     *,
     any_time: bool = False,
+    how: str = "mix",
     judge: Judge | None = None,
 ) -> list[Question]:
     """Chooses clips to be rated.
 
-    Uniformly if nothing judges, as in the paper. Else a mix: high predicted ratings, because random
-    motion hardly ever deserves one and the reward is made of them; disagreement between the
-    predictor's members, where a rating tells most; and any, so that nothing stays unseen. Within a round
-    they spread over the demo.
+    Uniformly if nothing judges, and in the paper. Else by one or several reasons: high predicted ratings,
+    because random motion hardly ever deserves one and the reward is made of them; disagreement between
+    the predictor's members, where a rating tells most; and any, so that nothing stays unseen. Within a
+    round they spread over the demo.
 
     Args:
         rollouts: What the agent did, (N, T).
@@ -57,6 +67,7 @@ def choose(
         demo_steps: Control steps of the demo; a clip ends before them.
         rng: Decides.
         any_time: Pair a clip with any moment of the demo instead of the moment of its own clock.
+        how: One of ``CHOICES``.
         judge: What the predictor says of a clip beside the demo, if there is one.
 
     Returns:
@@ -75,18 +86,26 @@ def choose(
         middle = clip_steps // 2
         demo = np.maximum(rollouts.clock[lanes, starts + middle].astype(int) - middle, 0)
     within = np.flatnonzero(demo + clip_steps <= demo_steps)
-    if judge is not None:  # looking at some of them is enough
-        within = within[: max(_CANDIDATES, 20 * count)]
+    shares = CHOICES[how] if judge is not None else CHOICES["uniform"]
+    scores: dict[str, np.ndarray] = {}
+    if judge is not None and set(shares) != {"any"}:
+        within = within[: max(_CANDIDATES, 20 * count)]  # looking at some of them is enough
+        scores["high"], scores["disagreement"] = judge(lanes[within], starts[within], demo[within])
     lanes, starts, demo = lanes[within], starts[within], demo[within]
-    ranks = [np.arange(len(lanes))]
-    if judge is not None:
-        rating, doubt = judge(lanes, starts, demo)
-        ranks = [np.argsort(-rating, kind="stable"), np.argsort(-doubt, kind="stable"), ranks[0]]
     chosen: list[int] = []
-    for share, rank in zip(_SHARES[-len(ranks) :], ranks, strict=True):
-        wanted = count if rank is ranks[-1] else len(chosen) + round(share * count)
-        _take(chosen, rank, min(wanted, count), lanes, starts, demo, clip_steps, spread=judge is not None)
-    return [Question(lane=int(lanes[i]), start=int(starts[i]), demo_step=int(demo[i])) for i in chosen]
+    reasons: list[str] = []
+    for reason, share in shares.items():
+        rank = np.arange(len(lanes)) if reason == "any" else np.argsort(-scores[reason], kind="stable")
+        wanted = count if reason == list(shares)[-1] else len(chosen) + round(share * count)
+        _take(chosen, rank, min(wanted, count), lanes, starts, demo, clip_steps, spread=bool(scores))
+        reasons += [reason] * (len(chosen) - len(reasons))
+    return [
+        Question(
+            lane=int(lanes[i]), start=int(starts[i]), demo_step=int(demo[i]), choice=reason,
+            score=float(scores[reason][i]) if reason in scores else None,
+        )
+        for i, reason in zip(chosen, reasons, strict=True)
+    ]  # fmt: skip
 
 
 def _places(rollouts: Rollouts, clip_steps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
+from trainer.choice import CHOICES
 from trainer.errors import UserError
 from trainer.policy import PolicyConfig
 from trainer.practice import PracticeConfig
@@ -39,8 +40,8 @@ class RatingsConfig:
     pairing: str = "any"
     """Before practice a clip is asked beside "any" moment of the demo, or beside the same "time"."""
     choice: str = "mix"
-    """Which of the possible clips are asked: "uniform", or a "mix" of those rated highest, those that
-    the predictor's members disagree on, and any, spread over the demo."""
+    """Which of the possible clips are asked: "uniform"; those rated "high"; those of most "disagreement"
+    between the predictor's members; or a "mix" of all three. All but the first spread over the demo."""
     rounds: int = 10
     """A simulated rater's first ratings come in so many rounds, with a refit after each."""
     queue: int = 12
@@ -56,7 +57,7 @@ class RatingsConfig:
             raise ValueError(f"ratings.clip_seconds must be 0.05 to 5 s, got {self.clip_seconds}")
         _one_of("ratings.starts", self.starts, ("random", "standing"))
         _one_of("ratings.pairing", self.pairing, ("any", "time"))
-        _one_of("ratings.choice", self.choice, ("mix", "uniform"))
+        _one_of("ratings.choice", self.choice, tuple(CHOICES))
         if not 0 < self.online_share <= 1:
             raise ValueError(f"ratings.online_share must be in (0, 1], got {self.online_share}")
 

@@ -172,7 +172,8 @@ class Learner:
             self.demo_steps,
             rng,
             any_time=config.pairing == "any" and self.iteration == 0,
-            judge=judge if config.choice == "mix" and snapshot is not None else None,
+            how=config.choice,
+            judge=judge if snapshot is not None else None,
         )
 
     def predict(self, snapshot: Snapshot, segment: Segment, demo_step: int) -> float:
