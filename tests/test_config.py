@@ -46,7 +46,10 @@ def test_overrides_beat_the_file(tmp_path):
         ("method = 'papers'", "method must be one of onedemo, paper, got 'papers'"),
         ("[ratings]\nstarts = 'flying'", "ratings.starts must be one of random, standing, got 'flying'"),
         ("[ratings]\npairing = 'x'", "ratings.pairing must be one of any, time, got 'x'"),
-        ("[ratings]\nchoice = 'x'", "ratings.choice must be one of mix, uniform, got 'x'"),
+        (
+            "[ratings]\nchoice = 'x'",
+            "ratings.choice must be one of uniform, mix, high, disagreement, got 'x'",
+        ),
         ("[ratings]\nrounds = 0", "ratings.rounds must be at least 1, got 0"),
         ("[predictor]\nkind = 'x'", "predictor.kind must be one of network, metric, got 'x'"),
         ("[predictor]\nmembers = 0", "predictor.members must be at least 1, got 0"),

@@ -188,7 +188,7 @@ def test_probabilities_are_an_ordered_logit_of_the_distance(fitted, view):
         formula = 1 / (1 + np.exp(-steepness * (thresholds - distance[:, None])))
         np.testing.assert_allclose(at_least, formula, atol=1e-4)
         order = np.argsort(distance)
-        assert (np.diff(at_least[order], axis=0) <= 1e-5).all()  # farther is never better
+        assert (np.diff(at_least[order], axis=0) <= 1e-4).all()  # farther is never better, but for rounding
     np.testing.assert_allclose(
         snapshot.probabilities(frames, obs, np.zeros((*frames.shape, 3))), chances.mean(axis=0), atol=1e-6
     )

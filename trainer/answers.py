@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from trainer.database import Database, now
 from trainer.records import Segment
@@ -51,6 +51,8 @@ class RatedSegment:
     demo_step: int
     segment: Segment
     value: int
+    mark: tuple[int, int] | None = None
+    """Where it goes wrong: first step, step after the last."""
 
 
 class Answers(Database):
@@ -229,9 +231,38 @@ class Answers(Database):
             counts.setdefault((name, stage), [0] * 5)[value - 1] = ratings
         return counts
 
-    def iter_ratings(self, run: str | None = None) -> Iterator[tuple]:
-        """Rows of the view ``ratings`` in order of their number, streamed."""
+    def iter_ratings(self, run: str | None = None, **only: str | int | None) -> Iterator[tuple]:
+        """Rows of the view ``ratings`` in order of their number, streamed.
+
+        Args:
+            run: Of this run alone.
+            only: Of these values of other columns alone, such as ``rater="Ann"``; None: of any.
+        """
+        only = {"run": run, **only}
+        unknown = set(only) - set(RATING_COLUMNS)
+        if unknown:
+            raise ValueError(f"ratings have no column {min(unknown)!r}")
+        chosen = {name: value for name, value in only.items() if value is not None}
+        where = " AND ".join(f"{name} = ?" for name in chosen) or "1"
         return self.stream(
-            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
-            (run,),
+            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE {where} ORDER BY id",
+            tuple(chosen.values()),
         )
+
+    def newest_ratings(self, run: str, most: int, columns: Sequence[str]) -> list[tuple]:
+        """Columns of the view ``ratings``, or of events, of the newest ratings of a run, oldest first."""
+        rows = self.rows(
+            f"SELECT {', '.join(columns)} FROM ratings WHERE run = ? ORDER BY id DESC LIMIT ?", (run, most)
+        )
+        return rows[::-1]
+
+    def restore_rating(self, row: Mapping[str, Any], rater_id: int) -> None:
+        """Stores a rating of an export as it was: number, time and prediction."""
+        with self.transaction() as db:
+            names = ("id", "clip_id", "value", "repeat", "mark_start", "mark_end", "snapshot", "predicted",
+                     "latency_ms", "created_at")  # fmt: skip
+            db.execute(
+                f"INSERT INTO events (rater_id, kind, {', '.join(names)})"
+                f" VALUES (?, 'rate', {', '.join('?' * len(names))})",
+                (rater_id, *(row[name] for name in names)),
+            )

@@ -33,6 +33,8 @@ class Simulated:
     """In the store."""
     rate: Callable[[Segment, int], int | None]
     """(segment, demo step) to a rating, 1..5, or None: declined, another clip is asked instead."""
+    mark: Callable[[Segment, int], tuple[int, int] | None] | None = None
+    """The same to where it goes wrong, as steps from the clip's start; None: it does not mark."""
 
 
 def due_in_round(number: int, rounds: int, total: int) -> int:
@@ -143,7 +145,7 @@ class Asking:
         clips = self._store.add_clips(self._run, new)
         if self.clips is not None:
             self.clips.submit(clips)
-        return self._simulated is not None and self._answer(self._simulated, clips, new)
+        return self._simulated is not None and self._answer(self._simulated, learner, clips, new)
 
     def _missing(self, learner: Learner, snapshot: Snapshot | None) -> int:
         # Waiting is read before given, so that a press in between is missing from neither.
@@ -154,13 +156,15 @@ class Asking:
         queue = min(self._config.ratings.queue, self.target - given)
         return queue - len(waiting) if len(waiting) <= _FULL * queue else 0
 
-    def _answer(self, simulated: Simulated, clips: list[Clip], cut: list[NewClip]) -> bool:
+    def _answer(self, simulated: Simulated, learner: Learner, clips: list[Clip], cut: list[NewClip]) -> bool:
         """Has fresh clips rated by the simulated rater; whether it declined any."""
         rater, declined = self._store.ensure_rater(simulated.name, "simulated"), False
         for clip, new in zip(clips, cut, strict=True):
             value = simulated.rate(new.segment, clip.demo_step)
             if value is not None:
-                self._store.rate(clip.id, rater.id, value, latency_ms=0)
+                mark = simulated.mark(new.segment, clip.demo_step) if simulated.mark else None
+                seconds = (mark[0] * learner.dt, mark[1] * learner.dt) if mark else None
+                self._store.rate(clip.id, rater.id, value, latency_ms=0, mark=seconds)
                 self._declined = 0
                 continue
             self._store.skip(clip.id, rater.id, latency_ms=0)

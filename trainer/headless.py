@@ -19,7 +19,7 @@ from trainer.hidden import hidden_path, load_hidden
 from trainer.learner import Learner
 from trainer.loop import Trainer
 from trainer.predictor import Snapshot
-from trainer.raters import Oracle, make_rater
+from trainer.raters import Oracle, make_rater, marker
 from trainer.records import Demo
 from trainer.runs import add_run, find_run, program_version
 from trainer.store import Store
@@ -70,8 +70,8 @@ def train(
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     trainer = Trainer(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
-        simulated=Simulated(name=rater, rate=simulated.rate), cache_dir=cache_dir, watch=watch,
-        start=start,
+        simulated=Simulated(name=rater, rate=simulated.rate, mark=marker(simulated)),
+        cache_dir=cache_dir, watch=watch, start=start,
     )  # fmt: skip
     try:
         with hold(trainer.directory / "lock"):

@@ -19,6 +19,12 @@ _STREAM = 1511
 """Sets a rater's random numbers apart from others that the same seed gives."""
 
 
+_SHORTEST_MARK = 4
+"""Control steps: about a frame."""
+_STANDS_OUT = 0.5
+"""Of the width of a class."""
+
+
 class RatingBudgetSpent(Exception):
     """The rater was asked once more than it agreed to."""
 
@@ -53,6 +59,9 @@ class Judge(Budget):
         seed: Of what chance there is in the errors.
         errors: What it gets wrong.
     """
+
+    marking = False
+    """Whether it also says where a clip goes wrong."""
 
     def __init__(
         self,
@@ -101,6 +110,30 @@ class Judge(Budget):
             return None
         self.given += 1
         return min(5, 1 + int(np.searchsorted(look.chances.cumsum(), rng.random(), side="right")))
+
+    def mark(self, segment: Segment, demo_step: int) -> tuple[int, int] | None:
+        """Where a clip goes wrong, as a person would mark it: the one stretch that is worst.
+
+        Args:
+            segment: W control steps of the robot.
+            demo_step: Where the demo clip beside it begins.
+
+        Returns:
+            First step and step after the last; None if no stretch stands out by half a class.
+        """
+        distances = self.distance(segment.qpos, segment.qvel, demo_step)
+        # The stretch with the most distance above the mean (Kadane's algorithm, by prefix sums).
+        above = np.concatenate([[0.0], np.cumsum(distances - distances.mean())])
+        gains = above - np.minimum.accumulate(above)
+        end = int(gains.argmax())
+        start = int(above[: end + 1].argmin())
+        inside = np.zeros(len(distances), bool)
+        inside[start:end] = True
+        if end - start < _SHORTEST_MARK or len(distances) - (end - start) < _SHORTEST_MARK:
+            return None
+        width = Look(distances=distances, thresholds=self._thresholds).width
+        stands_out = distances[inside].mean() - distances[~inside].mean() >= _STANDS_OUT * width
+        return (start, end) if stands_out else None
 
     def close(self) -> None:
         """Holds nothing that would have to be freed."""

@@ -6,7 +6,9 @@ ratings say how much each part of the difference matters, and at which distances
     d(f, s)  = sqrt(sum_i w_i (track_i(f) - body_i(s))^2 + e)            distance of frame and state
     P(y > k) = sigmoid(g (t_k - mean of d over the clip)),  t_1 > t_2 > t_3 > t_4
 
-the ordered logit of McCullagh 1980 (proportional odds) on a distance. Where the track is seen
+the ordered logit of McCullagh 1980 (proportional odds) on a distance. Where the rater has marked a part
+of a clip as wrong, that part is taken to be further off than the rest, with the probability
+sigmoid(g (mean of d inside - mean outside)). Where the track is seen
 (``trainer/appearance.py``) that is 23 numbers, so a few dozen ratings fit it; a network of thousands has
 to learn first that near is like. Where it is not, the track itself is fitted to the ratings, too
 (``trainer/imagined.py``).
@@ -29,6 +31,7 @@ from torch.nn import functional
 
 from trainer import body
 from trainer.imagined import track_of
+from trainer.marks import marked_steps
 from trainer.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
 from trainer.store import RatedSegment
 
@@ -129,11 +132,13 @@ class _Clips:
     """(n,), 0..4."""
     weights: torch.Tensor
     """(n,), in the loss."""
+    inside: torch.Tensor
+    """Steps where the rater said that it goes wrong, (n, W'), 0 or 1."""
 
     def take(self, index: torch.Tensor) -> _Clips:
         return _Clips(
             frames=self.frames[index], robot=self.robot[index], classes=self.classes[index],
-            weights=self.weights[index],
+            weights=self.weights[index], inside=self.inside[index],
         )  # fmt: skip
 
 
@@ -157,6 +162,7 @@ def fit(
         robot=torch.from_numpy(_body(np.stack([r.segment.obs[every // 2 :: every] for r in ratings]))),
         classes=classes_n,
         weights=(len(ratings) / (CLASSES * counts)).clamp(_LEAST, _MOST)[classes_n],
+        inside=torch.from_numpy(np.stack([marked_steps(r)[every // 2 :: every] for r in ratings])),
     )
     members, losses = [], []
     for k in range(config.members if seen else 2 * config.members):
@@ -217,18 +223,25 @@ def _fit_one(
     if view.track is None:  # many more numbers: large steps first, small ones in the end
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2 * _RATE, total_steps=_UPDATES)
     loss = torch.zeros(())
+    marked = (clips.inside.sum(1) > 0) & (clips.inside.sum(1) < clips.inside.shape[1])
     for _ in range(_UPDATES):
         if view.track is None:
             track = track_of(basis, places, view.fps)
             squares = (track[clips.frames] - clips.robot).square()
         thresholds = _ascending(first, gaps)
-        distance_n = (squares @ log_weights.exp() + _TINY).sqrt().mean(dim=1)
+        distance_nW = (squares @ log_weights.exp() + _TINY).sqrt()
+        distance_n = distance_nW.mean(dim=1)
         logits = log_steepness.exp() * (thresholds - distance_n[:, None])
         above = torch.sigmoid(logits.flip(-1))  # P(y >= 2), ... P(y >= 5)
         one = torch.ones_like(above[:, :1])
         chances = torch.cat([one, above], -1) - torch.cat([above, 0 * one], -1)
         given = chances.gather(1, clips.classes[:, None])[:, 0].clamp_min(1e-4)
         loss = -(clips.weights * given.log()).mean()
+        if marked.any():
+            within = (distance_nW * clips.inside).sum(1) / clips.inside.sum(1).clamp_min(1)
+            without = (distance_nW * (1 - clips.inside)).sum(1) / (1 - clips.inside).sum(1).clamp_min(1)
+            further = functional.logsigmoid(log_steepness.exp() * (within - without))[marked]
+            loss = loss - further.sum() / len(marked)
         if known is None:
             penalty = _PULL * (log_weights - prior).square().sum()
         else:

@@ -20,6 +20,7 @@ from torch import nn
 from torch.nn import functional
 
 from trainer.errors import UserError
+from trainer.marks import split_marks
 from trainer.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
 from trainer.store import RatedSegment
 
@@ -171,6 +172,7 @@ def fit(
     """
     assert start is None or isinstance(start, NetworkSnapshot), "predictor.fit has checked it"
     generator = torch.Generator().manual_seed(seed)
+    ratings, frames = split_marks(ratings, frames)
     obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
     inputs = standard_inputs(obs, actions)
     mean, std = inputs.mean(axis=(0, 1)), inputs.std(axis=(0, 1)) + 0.05

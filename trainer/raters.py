@@ -12,7 +12,7 @@ Shapes: W control steps, q = v = 6.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -30,6 +30,9 @@ __all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appea
 
 THRESHOLDS = (0.9, 1.3, 1.7, 2.15)
 """Mean distances (see ``appearance``) beyond which the oracle takes one point off."""
+
+MARKS = "marks"
+"""In a rater's name: it marks, too."""
 
 _CHOICES = "oracle, script, script:TABLE.json, package.module:Class"
 
@@ -127,7 +130,7 @@ def make_rater(
 
     Args:
         name: ``oracle``, ``script``, ``script:TABLE.json`` or ``package.module:Class``, then ``+`` and
-            error models or ``seed:N``.
+            error models, ``seed:N``, or ``marks``: it also says where a clip goes wrong.
         hidden: The demo's states, if it has any; only the oracle gets them.
         demo: What is compared with.
         budget: Ratings the rater will give in a run, enforced by itself.
@@ -139,7 +142,7 @@ def make_rater(
     """
     base, *parts = name.split("+")
     kind, _, rest = base.partition(":")
-    errors, own_seed = parse_errors(parts, name)
+    errors, own_seed = parse_errors([part for part in parts if part != MARKS], name)
     seed = seed if own_seed is None else own_seed
     if base == "oracle":
         if hidden is None:
@@ -148,10 +151,14 @@ def make_rater(
                 "use a built-in demo or a table of marks (--rater script), or rate it yourself with "
                 "`onedemo serve`"
             )
-        return Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
+        judge: Judge = Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
+        judge.marking = MARKS in parts
+        return judge
     if kind == "script":
         marks = load_marks(Path(rest) if rest else table_path(demo.path), demo)
-        return Script(marks, budget=budget, given=given, seed=seed, errors=errors)
+        judge = Script(marks, budget=budget, given=given, seed=seed, errors=errors)
+        judge.marking = MARKS in parts
+        return judge
     if kind == "oracle" or not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
         raise UserError(f"unknown rater {base!r}; choose one of: {_CHOICES}")
     if parts:
@@ -160,3 +167,8 @@ def make_rater(
             f"let {base} make its own errors"
         )
     return OwnRater(base, demo=demo, budget=budget, given=given)
+
+
+def marker(rater: SimulatedRater) -> Callable[[Segment, int], tuple[int, int] | None] | None:
+    """How a rater says where a clip goes wrong; None if it does not."""
+    return rater.mark if isinstance(rater, Judge) and rater.marking else None

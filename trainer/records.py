@@ -131,6 +131,10 @@ class Clip:
     """By what it was chosen: a predicted rating, a disagreement; None if by chance."""
 
 
+ROLES = ("annotator", "researcher", "simulated")
+"""What a rater may be."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Rater:
     """A person, or a simulated one."""
@@ -138,7 +142,7 @@ class Rater:
     id: int
     name: str
     role: str
-    """"annotator", "researcher" or "simulated"."""
+    """One of ``ROLES``."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from trainer.answers import RATING_COLUMNS, Answers, RatedSegment, Rating
@@ -94,6 +94,32 @@ class Store(People, Answers):
                 )
             return added
 
+    def restore_clips(self, clips: Iterable[tuple[Clip, Segment]]) -> set[int]:
+        """Stores clips of an export under the numbers they had, which it returns; nobody is asked them."""
+        numbers = set()
+        with self.transaction() as db:
+            for clip, segment in clips:
+                db.execute(
+                    f"INSERT INTO clips ({_CLIP}, state, created_at)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 'withdrawn', ?)",
+                    (*(getattr(clip, name) for name in _CLIP.split(", ")), now()),
+                )
+                db.execute("INSERT INTO segments VALUES (?, ?)", (clip.id, pack_segment(segment)))
+                numbers.add(clip.id)
+        return numbers
+
+    def rated_clips(self, run: str | None = None) -> Iterator[tuple[Clip, Segment]]:
+        """Every clip that has a rating, with its segment, in order, streamed."""
+        columns = ", ".join(f"c.{name}" for name in _CLIP.split(", "))
+        rows = self.stream(
+            f"SELECT {columns}, s.data FROM clips c JOIN segments s ON s.clip_id = c.id"
+            " WHERE (?1 IS NULL OR c.run = ?1) AND c.id IN (SELECT clip_id FROM ratings) ORDER BY c.id",
+            (run,),
+        )
+        for *values, data in rows:
+            clip = Clip(**dict(zip(_CLIP.split(", "), values, strict=True)))
+            yield clip, unpack_segment(data)
+
     def set_clip_state(self, clip_ids: Sequence[int], state: str) -> None:
         """Moves clips to "cut" (no picture yet), "ready" (may be shown) or "withdrawn" (too old)."""
         with self.transaction() as db:
@@ -170,3 +196,9 @@ class Store(People, Answers):
             (run, after),
         )
         return [{"number": n, "snapshot": s, "env_steps": e, **json.loads(stats)} for n, s, e, stats in rows]
+
+    def last_iteration(self, run: str) -> dict | None:
+        """The newest iteration of a run, as ``iterations``; None if there is none."""
+        rows = self.rows("SELECT MAX(number) FROM iterations WHERE run = ?", (run,))
+        newest = rows[0][0]
+        return self.iterations(run, after=newest - 1)[0] if newest is not None else None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +49,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "ordinal loss": _NETWORK | {"predictor.ordinal": True},
     "ordinal, 3 networks": _NETWORK | {"predictor.ordinal": True, "predictor.members": 3},
     "metric": {"method": "onedemo"},
+    "additional layer, marks": _NETWORK,
+    "metric, marks": {"method": "onedemo"},
 }
-"""Settings of each predictor: the paper's five, then its network with one more change, then onedemo's."""
+"""Settings of each predictor: the paper's five, then its network with one more change, then onedemo's; and
+two of them with marks where clips go wrong, from the same number of ratings."""
+MARKED = ("additional layer, marks", "metric, marks")
 
 OTHER_MOVES = ("hopper-backflip", "hopper-flip-clean", "hopper-hop")
 """Demos whose disturbed moves stand for what other policies do; the one that is rated is left out."""
@@ -71,7 +75,8 @@ def run(settings: dict[str, Any], seed: int, scratch: Path, cache: Path | None =
 
     Returns:
         ``classes``: how many ratings of each class there are to fit, to validate and to test; ``truth``: the
-        true rating of what the predictors are asked besides; ``variants``: the figures of each, by name.
+        true rating of what the predictors are asked besides; ``marked``: how many of the fitted ratings
+        have a mark where they are used; ``variants``: the figures of each, by name.
     """
     torch.set_num_threads(1)
     demo = find_demo(settings["demo"], scratch)
@@ -107,8 +112,9 @@ def run(settings: dict[str, Any], seed: int, scratch: Path, cache: Path | None =
     variants = {}
     for name, variant in VARIANTS.items():
         student = learner(variant, seed)
+        given = [replace(r, mark=rater.mark(r.segment, r.demo_step)) if name in MARKED else r for r in fitted]
         began = time.process_time()
-        snapshot, _ = student.fit(fitted, 1)
+        snapshot, _ = student.fit(given, 1)
         fit_s = time.process_time() - began
         variants[name] = {
             **unseen(student, snapshot, validation, tested), **exam.figures(snapshot), "fit_s": fit_s,
@@ -116,7 +122,8 @@ def run(settings: dict[str, Any], seed: int, scratch: Path, cache: Path | None =
     classes = {
         "fitted": by_class(fitted), "validation": by_class(validation), "test": by_class(tested)
     }  # fmt: skip
-    return {"classes": classes, "truth": exam.truth, "variants": variants}
+    marked = sum(rater.mark(r.segment, r.demo_step) is not None for r in fitted)
+    return {"classes": classes, "truth": exam.truth, "marked": marked, "variants": variants}
 
 
 def ask(learner: Learner, rater: Oracle, count: int, rounds: int) -> list[RatedSegment]:

@@ -1,0 +1,65 @@
+"""Where a clip goes wrong: a marked stretch is learned from as worse than the rest of its clip.
+
+The paper leaves this to future work. The metric takes the marked steps to be further off than the others
+(``trainer/metric.py``). For the network, a rating with a mark becomes two: the others get a point more.
+Each part is drawn out to the length of a clip by repeating steps, so that a fit need not know of marks.
+
+Shapes: n ratings, W control steps a clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from trainer.records import Segment
+from trainer.store import RatedSegment
+
+INSIDE, OUTSIDE = 0, 1
+"""Points that the marked steps and the others differ from the rating of their clip."""
+
+
+def marked_steps(rating: RatedSegment) -> np.ndarray:
+    """1 at the steps inside a rating's mark, else 0: (W,), float32."""
+    inside = np.zeros(len(rating.segment), np.float32)
+    if rating.mark is not None:
+        inside[slice(*rating.mark)] = 1
+    return inside
+
+
+def split_marks(
+    ratings: Sequence[RatedSegment], frames: np.ndarray
+) -> tuple[Sequence[RatedSegment], np.ndarray]:
+    """Makes two ratings of each with a mark; without any mark all stays as it is.
+
+    Args:
+        ratings: n rated segments, all of W steps.
+        frames: Demo frame at each step of each segment, (n, W).
+
+    Returns:
+        The same of m >= n ratings, none with a mark.
+    """
+    if not any(rating.mark for rating in ratings):
+        return ratings, frames
+    parts, rows = [], []
+    for rating, row in zip(ratings, frames, strict=True):
+        inside = marked_steps(rating) > 0
+        if inside.all() or not inside.any():
+            parts.append(replace(rating, mark=None))
+            rows.append(row)
+            continue
+        for chosen, change in ((inside, INSIDE), (~inside, OUTSIDE)):
+            at = _drawn_out(np.flatnonzero(chosen), len(inside))
+            segment = rating.segment
+            cut = {name: getattr(segment, name)[at] for name in ("obs", "actions", "qpos", "qvel")}
+            value = min(5, max(1, rating.value + change))
+            parts.append(replace(rating, segment=Segment(**cut), value=value, mark=None))
+            rows.append(row[at])
+    return parts, np.stack(rows)
+
+
+def _drawn_out(at: np.ndarray, length: int) -> np.ndarray:
+    """So many entries of ``at``, in order and as evenly as can be."""
+    return at[np.arange(length) * len(at) // length]
