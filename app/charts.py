@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,8 @@ class Charts:
     def __init__(self, gui: Any, *, has_reward: bool, dark: bool) -> None:
         self.last = 0
         """Newest iteration that is drawn."""
-        self._rows: list[dict] = []
+        self.rows: list[dict] = []
+        """All iterations so far."""
         blue, teal, amber = ("#8ab0ff", "#5fd0b8", "#f0b661") if dark else ("#2f5dc4", "#0d8a72", "#b26a00")
         self._curves = [
             _Curve(gui, "predicted", "Predicted rating", blue, dark, (1.0, 5.0)),
@@ -39,10 +42,49 @@ class Charts:
         """Adds iterations to the curves."""
         if not rows:
             return
-        self._rows += rows
+        self.rows += rows
         self.last = rows[-1]["number"]
         for curve in self._curves:
-            curve.draw(self._rows)
+            curve.draw(self.rows)
+
+
+class Comparison:
+    """One figure of several runs over their control steps.
+
+    Args:
+        gui: The client's.
+        key: Which figure of an iteration.
+        title: Of the chart.
+        runs: Names of all that may be drawn.
+        dark: Whether the page is dark.
+    """
+
+    def __init__(self, gui: Any, key: str, title: str, *, runs: Sequence[str], dark: bool) -> None:
+        self._key, self._runs, self._limited = key, list(runs), key == "predicted"
+        nothing = np.array([0.0])
+        series = [
+            _line(run, colour, points=False)
+            for run, colour in zip(self._runs, itertools.cycle(_DARK_SERIES if dark else _SERIES))
+        ]
+        self._handle = gui.add_uplot(
+            data=(nothing, *[np.array([np.nan]) for _ in runs]),
+            series=({"label": "control steps"}, *series),
+            legend={"show": True},
+            **_plot(title, dark, (1.0, 5.0) if self._limited else None),
+        )
+
+    def draw(self, rows_of: Mapping[str, Sequence[dict]]) -> None:
+        """Draws the curves of some runs, by name; the others are empty."""
+        x, *curves = compared(rows_of, self._runs, self._key)
+        if not self._limited:  # uPlot finds no limits where a whole curve is missing
+            known = np.concatenate(curves)
+            known = known[np.isfinite(known)]
+            low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
+            margin = 0.05 * max(high - low, 1e-9)
+            self._handle.scales = {
+                "x": {"time": False}, "y": {"range": [float(low - margin), float(high + margin)]},
+            }  # fmt: skip
+        self._handle.data = (x, *curves)
 
 
 class _Curve:
@@ -50,30 +92,61 @@ class _Curve:
         self, gui: Any, key: str, title: str, colour: str, dark: bool, limits: tuple[float, float] | None
     ) -> None:
         self._key = key
-        ink = "#9ba7b7" if dark else "#566173"
-        grid = {"stroke": "rgba(255,255,255,.06)" if dark else "#e9ecf1", "width": 1}
-        axis = {"stroke": ink, "grid": grid, "ticks": {"show": False}, "font": "11px system-ui, sans-serif"}
-        scales: dict[str, Any] = {"x": {"time": False}}
-        if limits:
-            scales["y"] = {"range": list(limits)}
         self._handle = gui.add_uplot(
             data=(np.array([0.0]), np.array([np.nan])),
-            series=(
-                {"label": "iteration"},
-                {"label": title, "stroke": colour, "width": 2, "points": {"show": False}, "spanGaps": True},
-            ),
-            title=title,
-            scales=scales,
-            axes=(axis | {"size": 30}, axis | {"size": 46}),
+            series=({"label": "iteration"}, _line(title, colour, points=False)),
             legend={"show": False},
-            cursor={"drag": {"x": True, "y": False}},
-            height=190,
-            padding=(10, 14, 0, 0),
+            **_plot(title, dark, limits),
         )
 
     def draw(self, rows: list[dict]) -> None:
         x, y = curve_points(rows, self._key)
         self._handle.data = (x, y)
+
+
+_SERIES = ("#2f5dc4", "#b26a00", "#0d8a72", "#a23b8f", "#5b6472", "#c0392b")
+_DARK_SERIES = ("#8ab0ff", "#f0b661", "#5fd0b8", "#e58fd4", "#aab4c2", "#ff9c94")
+
+
+def _line(label: str, colour: str, *, points: bool) -> dict[str, Any]:
+    return {"label": label, "stroke": colour, "width": 2, "points": {"show": points}, "spanGaps": True}
+
+
+def _plot(title: str, dark: bool, limits: tuple[float, float] | None) -> dict[str, Any]:
+    """What all charts look like."""
+    ink = "#9ba7b7" if dark else "#566173"
+    grid = {"stroke": "rgba(255,255,255,.06)" if dark else "#e9ecf1", "width": 1}
+    axis = {"stroke": ink, "grid": grid, "ticks": {"show": False}, "font": "11px system-ui, sans-serif"}
+    scales: dict[str, Any] = {"x": {"time": False}}
+    if limits:
+        scales["y"] = {"range": list(limits)}
+    return {
+        "title": title, "scales": scales, "axes": (axis | {"size": 30}, axis | {"size": 46}),
+        "cursor": {"drag": {"x": True, "y": False}}, "height": 190, "padding": (10, 14, 0, 0),
+    }  # fmt: skip
+
+
+def compared(
+    rows_of: Mapping[str, Sequence[dict]], runs: Sequence[str], key: str, most: int = _POINTS
+) -> tuple[np.ndarray, ...]:
+    """Curves of several runs over one axis.
+
+    Args:
+        rows_of: Iterations of the runs that are drawn, by name.
+        runs: All runs, in the order of the curves.
+        key: Which figure.
+        most: Points of one curve at most.
+
+    Returns:
+        Control steps, ascending, (n,), and for each run its figure there, (n,): nan where it has none.
+    """
+    curves = {}
+    for run, rows in rows_of.items():
+        points = {row["env_steps"]: row[key] for row in rows if row.get(key) is not None}
+        stride = max(1, -(-len(points) // most))
+        curves[run] = dict(list(points.items())[::-1][::stride])
+    x = np.array(sorted({step for curve in curves.values() for step in curve}) or [0], np.float64)
+    return x, *[np.array([curves.get(run, {}).get(step, np.nan) for step in x], np.float64) for run in runs]
 
 
 def curve_points(rows: list[dict], key: str, most: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
@@ -107,3 +180,10 @@ def classes_html(counts: list[int]) -> str:
     )
     heading = f"<h3>Ratings by class <small>{total} in all</small></h3>"
     return f'<section class="od-classes">{heading}<ul>{rows}</ul></section>'
+
+
+def short(steps: int) -> str:
+    """A number of control steps, in a few characters."""
+    if steps >= 1_000_000:
+        return f"{steps / 1_000_000:.2f} M"
+    return f"{steps / 1000:.0f} k" if steps >= 10_000 else f"{steps}"

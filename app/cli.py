@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from app.bench import add_commands
+from app.cli_data import add_data_commands, add_data_dir, check_output
 from trainer.errors import UserError
-from trainer.files import check_writable
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -106,24 +106,9 @@ def _parser() -> argparse.ArgumentParser:
     show = _command(actions, "show", _demo_show, "what is known of a demo")
     show.add_argument("name")
     for command in (add, listing, show):
-        _data_dir(command)
+        add_data_dir(command)
 
-    rater = _command(commands, "rater", None, "people and their links")
-    actions = rater.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
-    new = _command(actions, "add", _rater_add, "a new rater; prints the link to send")
-    new.add_argument("name")
-    new.add_argument("--researcher", action="store_true", help="may watch, steer and export too")
-    new.add_argument("--url", default="http://127.0.0.1:8080", help="address people reach the page at")
-    people = _command(actions, "list", _rater_list, "everybody")
-    revoke = _command(actions, "revoke", _rater_revoke, "end a rater's links and sessions; ratings stay")
-    revoke.add_argument("name")
-    for command in (new, people, revoke):
-        _data_dir(command)
-
-    export = _command(commands, "export", _export, "the ratings as CSV")
-    _data_dir(export)
-    export.add_argument("--out", type=Path, metavar="FILE", help="write there instead of standard output")
-    export.add_argument("--run", dest="run_name", metavar="NAME", help="only this run")
+    add_data_commands(commands, _command)
 
     baseline = _command(commands, "baseline", None, "what the method is compared with")
     actions = baseline.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)
@@ -163,14 +148,8 @@ def _command(commands: Any, name: str, run: Any, summary: str) -> argparse.Argum
     return parser
 
 
-def _data_dir(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--data-dir", type=Path, default=Path("data"), metavar="DIR", help="where everything is kept (./data)"
-    )
-
-
 def _run_options(parser: argparse.ArgumentParser) -> None:
-    _data_dir(parser)
+    add_data_dir(parser)
     parser.add_argument("--demo", default="hopper-backflip", metavar="NAME", help="what to learn")
     parser.add_argument(
         "--run", dest="run_name", metavar="NAME", help="go on with this run, or name a new one"
@@ -245,7 +224,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
     config = _config(arguments)
     if arguments.json is not None:
-        _check_output(arguments.json, arguments.data_dir)
+        check_output(arguments.json, arguments.data_dir)
     demo = find_demo(arguments.demo, arguments.data_dir / "demos")
     store = Store(arguments.data_dir)
     try:
@@ -305,57 +284,6 @@ def _demo_show(arguments: argparse.Namespace) -> None:
     print(show(find_demo(arguments.name, arguments.data_dir / "demos")))
 
 
-def _rater_add(arguments: argparse.Namespace) -> None:
-    from app.links import issue_link, read_secret
-
-    name = arguments.name
-    if not 1 <= len(name.strip()) <= 64 or not name.isprintable():
-        raise UserError(f"a rater's name is 1 to 64 printable characters, got {name[:80]!r}")
-    with _open_store(arguments) as store:
-        rater = store.ensure_rater(name.strip(), "researcher" if arguments.researcher else "annotator")
-        print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
-
-
-def _rater_list(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments, must_exist=True) as store:
-        for rater in store.raters():
-            print(f"{rater.name:24} {rater.role}")
-
-
-def _rater_revoke(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments, must_exist=True) as store:
-        raters = {rater.name: rater for rater in store.raters()}
-        if arguments.name not in raters:
-            raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
-        ended = store.revoke_tokens(raters[arguments.name].id)
-        print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
-
-
-def _export(arguments: argparse.Namespace) -> None:
-    from app.exports import csv_blocks
-    from trainer.files import write_atomic
-
-    with _open_store(arguments, must_exist=True) as store:
-        run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
-        if run is not None and run not in runs:
-            raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
-        blocks = csv_blocks(store.iter_ratings(run))
-        if arguments.out is None:
-            for block in blocks:
-                sys.stdout.buffer.write(block)
-            sys.stdout.buffer.flush()
-            return
-        _check_output(arguments.out, arguments.data_dir)
-        write_atomic(arguments.out, blocks)
-
-
-def _check_output(file: Path, data_dir: Path) -> None:
-    """Raises UserError, before any work is done, if a result could not be written there."""
-    check_writable(file)
-    if file.absolute().parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
-        raise UserError(f"{file} is the database; choose another name")
-
-
 def _baseline_trpo(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
@@ -393,16 +321,6 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
     save_preferences(arguments.out, result)
     for key, value in asdict(result.curve[-1]).items():
         print(f"{key:18} {value:g}")
-
-
-def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
-    from contextlib import closing
-
-    from trainer.store import FILE_NAME, Store
-
-    if must_exist and not (arguments.data_dir / FILE_NAME).exists():
-        raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")
-    return closing(Store(arguments.data_dir))
 
 
 def _crop(text: str) -> tuple[int, int, int, int]:

@@ -1,16 +1,27 @@
-"""The Data tab: how many ratings there are, by whom, and how to get them."""
+"""The Data tab: how good the ratings are, by whom, and how to get them."""
 
 from __future__ import annotations
 
+import logging
+import threading
+import time
+from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from app.charts import classes_html
+from app.quality import Quality, quality, quality_by_rater, rating_rows
 from app.words import ANSWERS
-from trainer.records import Status
+from trainer.records import Rater, Status
 
 if TYPE_CHECKING:
     from app.session import Session
+
+log = logging.getLogger("onedemo.page")
+
+_EVERY_S = 3.0
+"""Figures are not worked out more often."""
 
 
 class Data:
@@ -22,7 +33,11 @@ class Data:
         self._trainer = session.page.trainer
         self._shown = False
         self._counted = -1
-        self._html = session.client.gui.add_html("")
+        self._counted_at = 0.0
+        self._busy = threading.Lock()
+        gui = session.client.gui
+        self._html = gui.add_html("")
+        gui.add_html(export_html(self._trainer.run, str(self._trainer.store.path.absolute())))
 
     def show(self) -> None:
         """Counts."""
@@ -34,31 +49,124 @@ class Data:
         self._shown = False
 
     def refresh(self, status: Status) -> None:
-        """Counts again if somebody looks."""
-        if not self._shown:
+        """Counts again if somebody looks, beside the thread that serves all pages."""
+        event = self._trainer.store.last_event()
+        old = time.monotonic() - self._counted_at > _EVERY_S
+        if not self._shown or event == self._counted or not (old or self._counted < 0):
             return
-        store, run = self._trainer.store, self._trainer.run
-        event = store.last_event()
-        if event == self._counted:
-            return
-        self._counted = event
-        self._html.content = data_html(run, status.method, store.tallies(run), str(store.path.absolute()))
+        if self._busy.acquire(blocking=False):
+            threading.Thread(target=self._count, args=(event, status.method), daemon=True).start()
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""
 
+    def _count(self, event: int, method: str) -> None:
+        try:
+            store, run = self._trainer.store, self._trainer.run
+            rows = rating_rows(store, run)
+            people = {rater.name: rater for rater in store.raters()}
+            self._html.content = data_html(
+                run, method, store.tallies(run), quality(rows), quality_by_rater(rows), people,
+                store.left_out(run),
+            )  # fmt: skip
+            self._counted, self._counted_at = event, time.monotonic()
+        except Exception:
+            log.exception("the figures of the Data tab could not be worked out")
+        finally:
+            self._busy.release()
 
-def data_html(run: str, method: str, counts: dict[tuple[str, str], list[int]], path: str) -> str:
-    """The whole tab.
+
+def data_html(
+    run: str, method: str, counts: Mapping[tuple[str, str], list[int]], whole: Quality,
+    each: Mapping[str, Quality], people: Mapping[str, Rater], left_out: set[int],
+) -> str:  # fmt: skip
+    """The tab's figures.
 
     Args:
         run: Whose ratings.
         method: How it learns.
         counts: As ``Store.tallies``.
-        path: Of the database.
+        whole: Quality of all ratings.
+        each: Of each rater's, by name.
+        people: Raters by name.
+        left_out: Raters whose ratings nothing learns from.
     """
     classes = [sum(row[value] for row in counts.values()) for value in range(5)]
     total = sum(classes)
+    where = f"in run <b>{escape(run)}</b>, method <b>{escape(method)}</b>"
+    return (
+        '<article class="od-data"><div class="od-data-top"><div><h1>Ratings</h1>'
+        f"<p>{total} rating{'' if total == 1 else 's'} {where}</p></div></div>"
+        f"{_summary(whole)}{classes_html(classes)}"
+        f"<section><h3>By rater</h3>{_raters_table(each, people, left_out)}</section>"
+        f"<section><h3>By rater and stage</h3>{_stages_table(counts)}</section></article>"
+    )
+
+
+def _summary(whole: Quality) -> str:
+    alike = whole.agreement
+    alpha, interval = "–", "no clip rated by two people yet"
+    if alike.alpha is not None:
+        alpha, interval = f"{alike.alpha:.2f}", f"{alike.clips} clips"
+        if alike.low is not None and alike.high is not None:
+            interval = f"{alike.low:.2f} to {alike.high:.2f}, {alike.clips} clips"
+    elif alike.clips:
+        interval = f"{alike.clips} clips, all rated the same"
+    cells = (
+        ("Agreement between raters", alpha, f"Krippendorff’s alpha; {interval}"),
+        ("Same on a second look", *_steady(whole)),
+        ("Time per rating", _number(whole.seconds, "s"), "median"),
+        ("Drift", _number(whole.drift, "points", sign=True), "last third against first, beside predictions"),
+    )
+    return '<dl class="od-quality">' + "".join(
+        f"<div><dt>{name}</dt><dd>{value}<small>{note}</small></dd></div>" for name, value, note in cells
+    ) + "</dl>"  # fmt: skip
+
+
+def _steady(figures: Quality) -> tuple[str, str]:
+    if figures.same is None or figures.apart is None:
+        return "–", "no clip shown twice yet"
+    return f"{100 * figures.same:.0f} %", f"of {figures.repeats} clips; {figures.apart:.1f} points apart"
+
+
+def _raters_table(each: Mapping[str, Quality], people: Mapping[str, Rater], left_out: set[int]) -> str:
+    if not each:
+        return '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
+    heads = ("Rater", "Ratings", "1 to 5", "Agreement", "Second look", "Median time", "Drift", "")
+    rows = "".join(
+        _rater_row(people[name], figures, people[name].id in left_out) for name, figures in each.items()
+    )
+    head = "".join(f'<th scope="col">{name}</th>' for name in heads)
+    return (
+        '<div class="od-scroll" tabindex="0" role="region" aria-label="Raters"><table><thead><tr>'
+        f"{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+        '<p class="od-quiet">Agreement is on the clips that others have rated too. A rater who is left out '
+        "stays in the data, marked, and nothing learns from the ratings until they are taken in again.</p>"
+    )
+
+
+def _rater_row(rater: Rater, figures: Quality, left_out: bool) -> str:
+    most = max(max(figures.shares), 1e-9)
+    bars = "".join(f'<i style="height:{max(4, 100 * share / most):.0f}%"></i>' for share in figures.shares)
+    shares = ", ".join(f"{100 * share:.0f} % {value}" for value, share in enumerate(figures.shares, 1))
+    warned = "".join(f"<em>{escape(warning)}</em>" for warning in figures.warnings)
+    alpha = figures.agreement.alpha
+    act, label = ("take in", "Take in") if left_out else ("leave out", "Leave out")
+    what = f'data-do="{act}" data-rater="{rater.id}"'
+    button = f'<button type="button" class="od-button od-small" {what}>{label}</button>'
+    bars = f'<span class="od-bars" role="img" aria-label="{shares}">{bars}</span>'
+    return (
+        f'<tr{" class=od-left-out" if left_out else ""}><th scope="row">{escape(rater.name)}{warned}</th>'
+        f"<td>{figures.ratings}</td><td>{bars}</td>"
+        f"<td>{'–' if alpha is None else f'{alpha:.2f}'}</td><td>{_steady(figures)[0]}</td>"
+        f"<td>{_number(figures.seconds, 's')}</td><td>{_number(figures.drift, '', sign=True)}</td>"
+        f"<td>{button}</td></tr>"
+    )
+
+
+def _stages_table(counts: Mapping[tuple[str, str], list[int]]) -> str:
+    if not counts:
+        return '<p class="od-quiet">Nothing yet.</p>'
     heads = "".join(
         f'<th scope="col" title="{answer}">{value}</th>' for value, answer in enumerate(ANSWERS, 1)
     )
@@ -68,21 +176,44 @@ def data_html(run: str, method: str, counts: dict[tuple[str, str], list[int]], p
         + f"<td><b>{sum(row)}</b></td></tr>"
         for (rater, stage), row in counts.items()
     )
-    table = (
-        '<div class="od-scroll"><table><thead><tr><th scope="col">Rater</th><th scope="col">Stage</th>'
-        f'{heads}<th scope="col">All</th></tr></thead><tbody>{rows}</tbody></table></div>'
-        if rows
-        else '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
-    )
-    where = f"in run <b>{escape(run)}</b>, method <b>{escape(method)}</b>"
     return (
-        '<article class="od-data"><div class="od-data-top"><div><h1>Ratings</h1>'
-        f"<p>{total} rating{'' if total == 1 else 's'} {where}</p></div>"
-        '<a class="od-button od-primary" href="/export.csv" download>Download CSV</a></div>'
-        f"{classes_html(classes)}<section><h3>By rater and stage</h3>{table}</section>"
+        '<div class="od-scroll" tabindex="0" role="region" aria-label="Stages"><table><thead><tr>'
+        '<th scope="col">Rater</th><th scope="col">Stage</th>'
+        f'{heads}<th scope="col">All</th></tr></thead><tbody>{rows}</tbody></table></div>'
+    )
+
+
+def export_html(run: str, path: str) -> str:
+    """Filter, preview, download. Drawn once, so that nothing that is being filled in is lost."""
+    values = "".join(f'<option value="{value}">{value}</option>' for value in range(1, 6))
+    query = f"?run={quote(run)}"
+    return (
+        '<article class="od-data od-export"><section><h3>Preview and download</h3>'
+        f'<form class="od-filter" data-filter><input type="hidden" name="run" value="{escape(run)}">'
+        '<label>Run <select name="run-which"><option value="this">this one</option>'
+        '<option value="all">all</option></select></label>'
+        '<label>Rater <input name="rater" maxlength="64" placeholder="anybody"></label>'
+        '<label>Stage <select name="stage"><option value="">any</option><option>pretrain</option>'
+        "<option>online</option></select></label>"
+        f'<label>Rating <select name="value"><option value="">any</option>{values}</select></label>'
+        '<label>Left out <select name="left_out"><option value="">with</option>'
+        '<option value="0">without</option></select></label>'
+        '<button class="od-button">Preview</button></form><div class="od-preview" aria-live="polite"></div>'
+        '<div class="od-downloads">'
+        f'<a class="od-button od-primary" href="/export.csv{query}" data-filtered="/export.csv" download>'
+        "Download CSV</a>"
+        f'<a class="od-button" href="/segments.parquet{query}" download>Segments (Parquet)</a>'
+        f'<a class="od-button" href="/card.md{query}" download>Data card</a></div>'
+        "<p class=od-quiet>The CSV has one header, times in UTC, formula-like cells made harmless. The "
+        "segments are the states and actions behind the clips. <code>onedemo import</code> reads both "
+        "back.</p></section>"
         "<section><h3>Where they are</h3><p>Every rating is a row of the view <code>ratings</code> in this "
         "SQLite file, which other programs may read while onedemo runs:</p>"
-        f"<p><code>{escape(path)}</code></p>"
-        "<p class=od-quiet>The CSV has the same columns, for all runs: one header, times in UTC, "
-        "formula-like cells made harmless.</p></section></article>"
+        f"<p><code>{escape(path)}</code></p></section></article>"
     )
+
+
+def _number(value: Any, unit: str, *, sign: bool = False) -> str:
+    if value is None:
+        return "–"
+    return f"{value:+.1f} {unit}".strip() if sign else f"{value:.1f} {unit}".strip()

@@ -1,4 +1,4 @@
-"""Ratings as CSV, in pieces, safe to open in a spreadsheet."""
+"""Ratings as CSV, in pieces, safe to open in a spreadsheet; and the segments behind them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import io
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from itertools import islice
+from pathlib import Path
 
-from trainer.store import RATING_COLUMNS
+from app.parquet import write_segments
+from trainer.store import RATING_COLUMNS, Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -39,9 +41,9 @@ def csv_blocks(rows: Iterable[tuple], *, rows_per_block: int = 500) -> Iterator[
         yield _drain(buffer)
 
 
-def file_name(now: datetime | None = None) -> str:
-    """A name for a download: the day and the time in UTC."""
-    return f"onedemo-ratings-{now or datetime.now(UTC):%Y%m%d-%H%M%S}.csv"
+def file_name(what: str, suffix: str, now: datetime | None = None) -> str:
+    """A name for a download: what it is, the day and the time in UTC."""
+    return f"onedemo-{what}-{now or datetime.now(UTC):%Y%m%d-%H%M%S}.{suffix}"
 
 
 def _drain(buffer: io.StringIO) -> bytes:
@@ -49,3 +51,19 @@ def _drain(buffer: io.StringIO) -> bytes:
     buffer.seek(0)
     buffer.truncate()
     return data
+
+
+def write_parquet(store: Store, run: str | None, file: Path) -> int:
+    """Writes the segments of all rated clips, of one run or of all; returns how many.
+
+    A file that is there already is replaced once the new one is whole.
+    """
+    runs = [entry for entry in store.runs() if run in (None, entry["id"])]
+    roles = {rater.name: rater.role for rater in store.raters()}
+    half = file.with_name(f".{file.name}.half")
+    try:
+        count = write_segments(half, store.rated_clips(run), runs, roles)
+        half.replace(file)
+    finally:
+        half.unlink(missing_ok=True)
+    return count

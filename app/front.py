@@ -13,8 +13,6 @@ import asyncio
 import socket
 import sqlite3
 import threading
-from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -22,7 +20,9 @@ from typing import Any, Protocol
 
 from aiohttp import ClientSession, WSMsgType, web
 
-from app import assets, exports
+from app import assets
+from app.actions import Actions
+from app.downloads import Downloads, Handler
 from app.links import hash_token, new_session_token
 from app.pictures import Pictures
 from trainer.errors import UserError
@@ -43,7 +43,8 @@ _MAX_CLIENT_MESSAGE = 1 << 20
 _SECURITY_HEADERS = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
-        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self'; "
+        "font-src 'self' data:; "
         # Viser follows ?websocket=ws://elsewhere; this keeps it at home.
         "connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
@@ -56,7 +57,6 @@ _RATER = web.RequestKey("rater", Rater)
 _SESSION = web.RequestKey("session", str)
 _MOST_SESSIONS = 8
 """Sessions of one browser that are looked at."""
-_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class Trained(Protocol):
@@ -73,13 +73,26 @@ class Trained(Protocol):
         """The picture of a clip."""
         ...
 
+    def rollout_file(self, iteration: int, suffix: str) -> Path:
+        """The best rollout of an iteration."""
+        ...
+
 
 class Inside(Protocol):
     """What the front needs to know of the page behind it."""
 
     port: int
     secret: str
-    pictures: Pictures
+
+    @property
+    def trainer(self) -> Trained:
+        """The run that is served."""
+        ...
+
+    @property
+    def pictures(self) -> Pictures:
+        """Of its demo."""
+        ...
 
     def note(
         self, rater_id: int, clip: int, *, mark: tuple[float, float] | None = None, reason: str | None = None
@@ -103,16 +116,15 @@ class Front:
     """The public door, in a thread with an event loop of its own.
 
     Args:
-        trainer: The run that is served.
-        page: The Viser page behind the door.
+        page: The Viser page behind the door; its trainer is the run that is served.
         host: Address to listen on.
         port: Port to listen on; 0 takes a free one.
     """
 
-    def __init__(self, trainer: Trained, page: Inside, *, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self._trainer = trainer
-        self._store = trainer.store
+    def __init__(self, page: Inside, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         self._page = page
+        self._store = page.trainer.store
+        self._actions = Actions(page)
         self._host = host
         self._port = port
         self._html = assets.page_html()
@@ -187,13 +199,15 @@ class Front:
                 web.get("/", self._home),
                 web.get(r"/r/{rater:\d{1,9}}", self._page_of),
                 web.post(r"/r/{rater:\d{1,9}}/note", self._note),
+                web.post(r"/r/{rater:\d{1,9}}/do", _for_researchers(self._do)),
                 web.get("/login", self._log_in),
                 web.get("/healthz", self._health),
-                web.get("/export.csv", self._export),
                 web.get("/static/{name}", self._static),
                 web.get(r"/clips/{clip:\d{1,15}}.jpg", self._clip),
+                web.get(r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", _for_researchers(self._rollout)),
                 web.get(r"/demo/frames/{index:\d{1,6}}.jpg", self._demo_frame),
                 web.get(r"/demo/examples/{name:[a-z]{1,20}}.jpg", self._demo_example),
+                *Downloads(self._store, _SECURITY_HEADERS).routes(_for_researchers),
             ]
         )
         return app
@@ -201,7 +215,7 @@ class Front:
     # Who may come in
 
     @web.middleware
-    async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         try:
             await self._recognise(request)
             if _RATER not in request and not _is_public(request.path):
@@ -293,8 +307,19 @@ class Front:
             raise web.HTTPConflict(text="That clip is not on screen any more.")
         return web.Response(status=204)
 
+    async def _do(self, request: web.Request) -> web.Response:
+        if not _same_origin(request):
+            raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        try:
+            await asyncio.to_thread(self._actions.do, request[_RATER], await request.json())
+        except (ValueError, UserError) as error:
+            raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
+        except sqlite3.Error as error:
+            raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
+        return web.Response(status=204)
+
     async def _health(self, request: web.Request) -> web.Response:
-        status = self._trainer.status()
+        status = self._page.trainer.status()
         healthy = status.phase != "failed"
         return web.json_response({"ok": healthy, "version": version("onedemo"), "phase": status.phase})
 
@@ -307,12 +332,21 @@ class Front:
     async def _clip(self, request: web.Request) -> web.StreamResponse:
         number = int(request.match_info["clip"])
         clip = await asyncio.to_thread(self._store.clip, number)
-        if clip is None or clip.run != self._trainer.run:
+        if clip is None or clip.run != self._page.trainer.run:
             raise web.HTTPNotFound()
-        path = self._trainer.clip_file(number)
+        path = self._page.trainer.clip_file(number)
         if not path.is_file():
             raise web.HTTPNotFound()
         return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
+
+    async def _rollout(self, request: web.Request) -> web.StreamResponse:
+        iteration, suffix = int(request.match_info["iteration"]), request.match_info["suffix"]
+        try:
+            path = await asyncio.to_thread(self._page.trainer.rollout_file, iteration, suffix)
+        except FileNotFoundError:
+            raise web.HTTPNotFound() from None
+        kind = {"jpg": "image/jpeg", "webm": "video/webm"}[suffix]
+        return web.FileResponse(path, headers=_KEEP | {"Content-Type": kind})
 
     async def _demo_frame(self, request: web.Request) -> web.StreamResponse:
         frames = await asyncio.to_thread(self._page.pictures.frames)
@@ -327,26 +361,6 @@ class Front:
         if example is None:
             raise web.HTTPNotFound()
         return web.Response(body=example, content_type="image/jpeg", headers=_KEEP)
-
-    async def _export(self, request: web.Request) -> web.StreamResponse:
-        if request[_RATER].role != "researcher":
-            raise web.HTTPForbidden(text="Only researchers can download the ratings.")
-        response = web.StreamResponse(headers=dict(_SECURITY_HEADERS))
-        response.content_type = "text/csv"
-        response.charset = "utf-8"
-        response.headers["Cache-Control"] = "no-store"
-        response.headers["Content-Disposition"] = f'attachment; filename="{exports.file_name()}"'
-        await response.prepare(request)
-        blocks = exports.csv_blocks(self._store.iter_ratings())
-        # One thread for the whole export: a SQLite connection belongs to the thread that opened it.
-        with ThreadPoolExecutor(max_workers=1) as reader:
-            try:
-                while block := await self._loop.run_in_executor(reader, next, blocks, None):
-                    await response.write(block)
-            finally:
-                await self._loop.run_in_executor(reader, blocks.close)
-        await response.write_eof()
-        return response
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
         if not _same_origin(request):
@@ -410,6 +424,15 @@ async def _forward(source, target) -> None:
             await target.send_str(message.data)
         else:
             return
+
+
+def _for_researchers(handler: Handler) -> Handler:
+    async def checked(request: web.Request) -> web.StreamResponse:
+        if request[_RATER].role != "researcher":
+            raise web.HTTPForbidden(text="Only researchers may do that.")
+        return await handler(request)
+
+    return checked
 
 
 def read_note(body: Any) -> dict[str, Any]:

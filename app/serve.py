@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import signal
 import sys
 import threading
@@ -12,10 +11,9 @@ from app.assignment import Again
 from app.front import Front, check_port
 from app.links import issue_link, read_secret
 from app.server import Page
+from app.study import Study
 from trainer.config import RunConfig
 from trainer.encoders import make_encoder
-from trainer.files import hold
-from trainer.loop import Trainer
 from trainer.records import Demo
 from trainer.render import RenderThread
 from trainer.runs import add_run, find_run
@@ -66,40 +64,27 @@ def serve(
     found = None if new_run else find_run(store, data_dir, demo, name=run, wanted=wanted)
     if found is not None:
         run, config = found
-    encoder = make_encoder(config.encoder, encoder_weights)
-    if found is None:
+    else:
+        make_encoder(config.encoder, encoder_weights)  # before anything is written
         run = add_run(store, data_dir, demo, config, name=run)
-    assert run is not None
-    directory = data_dir / "runs" / run
-    with hold(directory / "lock"):
-        _log_to(directory / "log")
-        trainer = Trainer(
-            store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
-            renderer=renderer,
-        )  # fmt: skip
-        page = Page(trainer, again=again)
-        front = Front(trainer, page, host=host, port=port)
-        ended = threading.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.set())
-        try:
-            url = front.start()
-            trainer.start()
-            for role in ("researcher", "annotator"):
-                rater = store.ensure_rater(role, role)
-                print(f"{role}: {issue_link(store, secret, rater, url)}", flush=True)
-            ended.wait()
-        finally:
-            front.close()
-            page.close()
-            trainer.stop()
-            renderer.close()
-            store.close()
-
-
-def _log_to(file: Path) -> None:
-    handler = logging.FileHandler(file)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    logger = logging.getLogger("onedemo")
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    study = Study(store, data_dir, renderer, encoder_weights=encoder_weights, device=config.device)
+    study.serve(run, demo, config)
+    page = Page(study.trainer, again=again, study=study)
+    study.served = page.serve
+    front = Front(page, host=host, port=port)
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    try:
+        url = front.start()
+        study.trainer.start()
+        for role in ("researcher", "annotator"):
+            rater = store.ensure_rater(role, role)
+            print(f"{role}: {issue_link(store, secret, rater, url)}", flush=True)
+        ended.wait()
+    finally:
+        front.close()
+        page.close()
+        study.close()
+        renderer.close()
+        store.close()

@@ -19,13 +19,14 @@ import rich
 import viser
 from viser import _messages
 
-from app import data, guide, rate, watch
+from app import data, guide, rate, runs, watch
 from app.assignment import Again, Ask, Assignment
 from app.desk import Desk, Mark
 from app.front import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from app.live import Live
 from app.pictures import Pictures
 from app.session import Session, TabMaker
+from app.study import Study
 from trainer.records import Rater
 
 log = logging.getLogger("onedemo.page")
@@ -48,17 +49,17 @@ class Page:
         trainer: The run that is shown.
         pictures: Of its demo; made from the demo's video if not given.
         again: How many clips are asked again; the usual shares if not given.
+        study: All runs; None if there is this one alone.
     """
 
-    def __init__(self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None) -> None:
-        self.trainer = trainer
+    def __init__(
+        self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None,
+        study: Study | None = None,
+    ) -> None:  # fmt: skip
+        self.study = study
         self.secret = secrets.token_urlsafe(32)
-        self.pictures = pictures or Pictures(trainer.demo)
-        self.assignment = Assignment(again=again or Again())
-        self.live = Live(trainer.acting, trainer.demo.seconds)
-        self.desks: dict[int, Desk] = {}
-        """Where people rate, by client."""
-        self._done: dict[str, list[Ask]] = {}
+        self._again = again or Again()
+        self._attach(trainer, pictures)
         self._raters: dict[int, Rater] = {}
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -73,6 +74,22 @@ class Page:
         self._server.on_client_disconnect(self._disconnect)
         self._ticker = threading.Thread(target=self._tick, name="onedemo-ticker", daemon=True)
         self._ticker.start()
+
+    def serve(self, trainer: Any) -> None:
+        """Shows another run from now on: every browser gets a new page."""
+        self.live.close()
+        self._attach(trainer, None)
+        for client in list(self._server.get_clients()):
+            hang_up(self._server, client)  # browsers come back by themselves
+
+    def _attach(self, trainer: Any, pictures: Pictures | None) -> None:
+        self.trainer = trainer
+        self.pictures = pictures or Pictures(trainer.demo)
+        self.assignment = Assignment(again=self._again)
+        self.live = Live(trainer.acting, trainer.demo.seconds)
+        self.desks: dict[int, Desk] = {}
+        """Where people rate, by client."""
+        self._done: dict[str, list[Ask]] = {}
 
     def close(self) -> None:
         """Ends all sessions and the server behind them."""
@@ -159,7 +176,7 @@ class Page:
 def tabs_of(role: str) -> list[TabMaker]:
     """The tabs a role gets, in order; the first one is shown first."""
     if role == "researcher":
-        return [watch.Watch, rate.Rate, data.Data, guide.Guide]
+        return [watch.Watch, runs.Runs, rate.Rate, data.Data, guide.Guide]
     return [rate.Rate, guide.Guide]
 
 

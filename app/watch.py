@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 from mjviser import ViserMujocoScene
 
-from app import charts
+from app import charts, progress
 from app.live import Moment
 from trainer.records import Status
 
@@ -65,9 +65,12 @@ class Watch:
         gui.add_html(_ROBOT)
         self._picture = gui.add_html("")
         self._time = gui.add_html("")
+        self._parts = gui.add_html(progress.timeline_html([], self._demo.seconds))
         gui.add_html(_preload(self._demo.frames))
         self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
         self._classes = gui.add_html("")
+        self._gallery = gui.add_html("")
+        gui.add_html(progress.PLAYER)
         self._put(self._picture, frame_html(0))
         self._put(self._time, time_html(0, 0, self._demo.seconds, ""))
 
@@ -98,7 +101,11 @@ class Watch:
                 return
             self._practised = status.iteration > 0
             self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until))
-            self._charts.extend(self._trainer.store.iterations(self._trainer.run, after=self._charts.last))
+            new = self._trainer.store.iterations(self._trainer.run, after=self._charts.last)
+            self._charts.extend(new)
+            if new:
+                self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
+                self._put(self._gallery, progress.gallery_html(self._charts.rows))
             self._put(
                 self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
             )
@@ -186,7 +193,7 @@ def strip_html(status: Status, confirming: bool) -> str:
     figures = [
         ("Method", escape(status.method) or "–", ""),
         ("Iteration", f"{status.iteration:,}", ""),
-        ("Steps", f"{_short(status.env_steps)}", f"of {_short(status.total_steps)}"),
+        ("Steps", f"{charts.short(status.env_steps)}", f"of {charts.short(status.total_steps)}"),
         ("Speed", f"{status.steps_per_s:,.0f}", "steps/s"),
         ("Predictor", f"{status.snapshot}" if status.snapshot else "–", "snapshot"),
         ("Ratings", f"{status.ratings}", f"of {status.target_ratings}"),
@@ -235,12 +242,6 @@ def _preload(frames: int) -> str:
     # Once fetched they stay in the browser's memory as long as these elements are there.
     images = "".join(f'<img src="/demo/frames/{n}.jpg" alt="">' for n in range(frames))
     return f'<div class="od-preload" aria-hidden="true">{images}</div>'
-
-
-def _short(steps: int) -> str:
-    if steps >= 1_000_000:
-        return f"{steps / 1_000_000:.2f} M"
-    return f"{steps / 1000:.0f} k" if steps >= 10_000 else f"{steps}"
 
 
 def drawn_model(path: Path) -> mujoco.MjModel:

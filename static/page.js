@@ -37,14 +37,15 @@ function flash(key) {
 
 // What is said of a clip besides its rating goes another way than presses, and must be there first.
 let noting = null;
-async function note(what) {
-  const answer = await fetch(`${location.pathname}/note`, {
+async function post(where, what) {
+  const answer = await fetch(`${location.pathname}/${where}`, {
     method: "POST",
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(what),
   });
   if (!answer.ok) throw new Error(await answer.text());
 }
+const note = (what) => post("note", what);
 
 function noteMark(player) {
   if (!player.clip) return;
@@ -145,6 +146,21 @@ document.addEventListener("click", (event) => {
   else if ("unmark" in data) {
     main()?.setMark(null);
     if (main()) noteMark(main());
+  } else if (data.video) {
+    const film = shown(".od-film");
+    const video = film.querySelector("video");
+    video.src = data.video;
+    film.showModal();
+    video.play().catch(() => {});
+    film.addEventListener("close", () => video.pause(), { once: true });
+  } else if (data.do) {
+    button.disabled = true; // until the page is drawn anew
+    const { do: action, ...fields } = data;
+    const numbers = Object.entries(fields).map(([name, value]) => [name, /^\d+$/.test(value) ? Number(value) : value]);
+    post("do", { do: action, ...Object.fromEntries(numbers) }).catch((error) => {
+      button.disabled = false;
+      button.textContent = error.message;
+    });
   } else if ("reason" in data) sayWhy(button.closest(".od-why"), data.reason);
   else if ("submit" in data) {
     // What is on screen is what is rated: slider messages are throttled and may come too late.
@@ -186,6 +202,41 @@ document.addEventListener("pointerdown", (event) => {
   addEventListener("pointermove", move);
   addEventListener("pointerup", up);
   addEventListener("pointercancel", up);
+});
+
+// The Data tab's filter: the preview, and the same choice for the download.
+function query(form) {
+  const fields = new URLSearchParams(new FormData(form));
+  if (fields.get("run-which") === "all") fields.delete("run");
+  fields.delete("run-which");
+  for (const [name, value] of [...fields]) if (!value.trim()) fields.delete(name);
+  return `?${fields}`;
+}
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest?.("[data-filter]");
+  if (!form) return;
+  event.preventDefault();
+  const place = form.parentElement.querySelector(".od-preview");
+  fetch(`/preview${query(form)}`)
+    .then((answer) => answer.text())
+    .then((html) => (place.innerHTML = html));
+});
+// A form that is an action.
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest?.("[data-act]");
+  if (!form) return;
+  event.preventDefault();
+  const place = form.parentElement.querySelector(".od-form-note");
+  const fields = Object.fromEntries(new FormData(form));
+  for (const input of form.querySelectorAll("[type=number]")) fields[input.name] = Number(input.value);
+  place.textContent = "One moment: the run at hand ends its iteration first.";
+  post("do", { do: form.dataset.act, ...fields }).catch((error) => (place.textContent = error.message));
+});
+document.addEventListener("input", (event) => {
+  const form = event.target.closest?.("[data-filter]");
+  if (!form) return;
+  for (const link of form.parentElement.querySelectorAll("[data-filtered]"))
+    link.href = link.dataset.filtered + query(form);
 });
 
 // Viser gives its slider no name.

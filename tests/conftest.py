@@ -103,7 +103,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
         again=Again(shared=0, repeated=0),
     )
-    front = Front(trainer, page, port=0)
+    front = Front(page, port=0)
     url = front.start()
     site = Site(trainer, page, front, url)
     secret = read_secret(tmp_path)

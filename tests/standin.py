@@ -50,6 +50,7 @@ class StandIn:
 
     def __init__(self, data_dir: Path, *, clips: int = 8, target: int = 200) -> None:
         self.store = Store(data_dir)
+        self.data_dir = data_dir
         self.run = "backflip-1"
         self.directory = data_dir / "runs" / self.run / "clips"
         self.directory.mkdir(parents=True)
@@ -102,6 +103,20 @@ class StandIn:
 
     def clip_file(self, clip_id: int) -> Path:
         return self.directory / f"{clip_id:06d}.jpg"
+
+    def rollout_file(self, iteration: int, suffix: str) -> Path:
+        from trainer.video import write_webm
+
+        if not 1 <= iteration <= len(self.store.iterations(self.run)):
+            raise FileNotFoundError(iteration)
+        file = self.directory / f"rollout-{iteration}.{suffix}"
+        if suffix == "jpg":
+            import cv2
+
+            cv2.imwrite(str(file), np.concatenate(drawn_frames(6, phase=iteration), axis=1)[::3, ::3])
+        else:
+            write_webm(file, drawn_frames(30, phase=iteration), fps=FPS)
+        return file
 
     def acting(self) -> Acting:
         return Acting(policy=Wobble(), rules=EpisodeRules())  # type: ignore[arg-type]

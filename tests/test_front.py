@@ -156,7 +156,7 @@ def test_websocket_needs_session_and_own_origin(site):
 
 def test_port_in_use_is_one_clear_sentence(site):
     with pytest.raises(UserError, match=rf"port {site.front.port} .* is in use; choose another with --port"):
-        Front(site.trainer, site.page, port=site.front.port).start()
+        Front(site.page, port=site.front.port).start()
 
 
 def test_viser_is_on_the_loopback_only(site):
@@ -182,4 +182,4 @@ def test_a_host_that_cannot_be_listened_on(site, host, port):
     with pytest.raises(UserError, match="cannot be opened"):
         check_port(host, port)
     with pytest.raises(UserError, match="cannot be opened"):
-        Front(site.trainer, site.page, host=host, port=port).start()
+        Front(site.page, host=host, port=port).start()

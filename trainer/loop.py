@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer import envs
+from trainer import envs, gallery
 from trainer.appearance import Track
 from trainer.appearance import learn as learn_appearance
 from trainer.asking import Asking, Simulated
@@ -96,8 +96,11 @@ class Trainer:
         self._learner: Learner | None = None
         self._snapshot: Snapshot | None = None
         self._fitted_event = 0
+        self._gallery = None
+        if renderer is not None:
+            self._gallery = gallery.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
         self._asking = Asking(store, run, config, simulated)
-        self._training_set = TrainingSet(store, run)
+        self._training_set = TrainingSet(store, run, self.dt)
         self._pool: Transitions | None = None
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
@@ -161,6 +164,16 @@ class Trainer:
     def clip_file(self, clip_id: int) -> Path:
         """The picture of a clip, all its frames; it is there once the clip is "ready"."""
         return self.directory / "clips" / f"{clip_id:06d}.jpg"
+
+    def rollout_file(self, iteration: int, suffix: str) -> Path:
+        """The best rollout of an iteration, as ``Gallery.file``.
+
+        Raises:
+            FileNotFoundError: If none was kept.
+        """
+        if self._gallery is None:
+            raise FileNotFoundError(f"nothing of iteration {iteration} was kept")
+        return self._gallery.file(iteration, suffix)
 
     def acting(self) -> Acting | None:
         """The newest policy beside the demo as the newest snapshot moves it; None until there is a policy.
@@ -285,6 +298,12 @@ class Trainer:
         before = learner.env_steps
         rollouts, stats = learner.iterate(snapshot)
         stats |= self._true_reward(rollouts)
+        if self._gallery is not None:
+            parts, lane, best = gallery.summarise(snapshot, rollouts, learner.frames_of, learner.demo_steps)
+            self._gallery.keep(
+                learner.iteration, rollouts.qpos[lane], learner.frames_of(rollouts.clock[lane])
+            )
+            stats |= {"timeline": parts, "best": best}
         self._work_s = time.monotonic() - began
         stats["steps_per_s"] = (learner.env_steps - before) / self._work_s
         self._pool, self._policy = rollouts, learner.policy()

@@ -1,0 +1,82 @@
+"""What researchers do with a press of a button, beyond watching: each action with the fields it takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from trainer.records import Rater
+from trainer.store import Store
+
+
+class Actions:
+    """Carries out actions of researchers.
+
+    Args:
+        page: What is served: its ``trainer`` is the run at hand, its ``study`` all runs.
+    """
+
+    def __init__(self, page: Any) -> None:
+        self._page = page
+
+    def do(self, who: Rater, body: Any) -> None:
+        """Does what a browser asks for: ``{"do": name, ...}``.
+
+        Args:
+            who: Asks; a researcher.
+            body: As JSON gave it.
+
+        Raises:
+            ValueError: If it is no action, or its fields are not what it takes.
+            UserError: If it cannot be done.
+        """
+        if not isinstance(body, dict) or not isinstance(body.get("do"), str):
+            raise ValueError("an action has a name")
+        actions = {
+            "leave out": self._leave_out, "take in": self._take_in, "open run": self._open,
+            "new run": self._create,
+        }  # fmt: skip
+        if body["do"] not in actions:
+            raise ValueError(f"there is no action {body['do'][:40]!r}")
+        actions[body["do"]](who, {key: value for key, value in body.items() if key != "do"})
+
+    def _leave_out(self, who: Rater, fields: dict[str, Any]) -> None:
+        self._store.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)
+
+    def _take_in(self, who: Rater, fields: dict[str, Any]) -> None:
+        self._store.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
+
+    def _open(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"run": str})
+        self._study.open(fields["run"])
+
+    def _create(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"demo": str, "method": str, "seed": int, "name": str, "predictor_from": str})
+        texts = {name: fields[name].strip() or None for name in ("name", "predictor_from")}
+        self._study.create(demo=fields["demo"], method=fields["method"], seed=fields["seed"], **texts)
+
+    @property
+    def _store(self) -> Store:
+        return self._page.trainer.store
+
+    @property
+    def _study(self) -> Any:
+        if self._page.study is None:
+            raise ValueError("there is this run alone")
+        return self._page.study
+
+    def _rater(self, fields: dict[str, Any]) -> int:
+        _check(fields, {"rater": int})
+        if fields["rater"] not in {rater.id for rater in self._store.raters()}:
+            raise ValueError(f"there is no rater {fields['rater']}")
+        return fields["rater"]
+
+
+def _check(fields: dict[str, Any], kinds: dict[str, type]) -> None:
+    if set(fields) != set(kinds) or any(type(fields[name]) is not kind for name, kind in kinds.items()):
+        raise ValueError(f"the action takes {', '.join(kinds)}")
+    for name, value in fields.items():
+        if isinstance(value, str) and not (len(value) <= _LONGEST and (value == "" or value.isprintable())):
+            raise ValueError(f"{name} is up to {_LONGEST} printable characters")
+
+
+_LONGEST = 100

@@ -1,0 +1,82 @@
+"""The data card of a data set of ratings, in Markdown: what it is, how it came about, what it is worth."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from app.columns import RATINGS, SEGMENTS, as_table
+from app.quality import Quality, quality, quality_by_rater, rating_rows
+from app.words import ANSWERS
+from trainer.runs import program_version
+from trainer.store import Store
+
+
+def card(store: Store, run: str | None = None, *, now: datetime | None = None) -> str:
+    """The card of one run's ratings, or of all runs.
+
+    Args:
+        store: Where they are.
+        run: Of this run alone.
+        now: When it is written.
+    """
+    runs = [entry for entry in store.runs() if run in (None, entry["id"])]
+    when = f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
+    parts = [
+        f"# Ratings of robot motion: {run or 'all runs'}\n\n"
+        f"Written by onedemo {program_version()}, {when}.\n",
+        "## What it is\n\n"
+        "People (or programs) saw two short movements side by side: a moment of one demonstration video, and "
+        "something a simulated robot (MuJoCo's Hopper) did. They rated how alike the two are:\n\n"
+        + "".join(f"- {value}: {answer}\n" for value, answer in enumerate(ANSWERS, 1))
+        + "\nThe question was: *How alike are the two movements?* Raters had two practice clips before the "
+        "first real one, could skip, take back, and mark where in a clip it goes wrong. The motion comes "
+        "from random actions at first (stage *pretrain*) and from the policy in training later (*online*); "
+        "which clips were asked is in `choice`. It is no random sample of anything: later clips depend on "
+        "earlier ratings.\n",
+        "## Runs\n\n" + "".join(_run(store, entry) for entry in runs),
+        "## Columns of the ratings (CSV)\n\nUTF-8, one header, one row a rating that holds. A text that a "
+        "spreadsheet would take for a formula begins with an apostrophe.\n\n" + as_table(RATINGS),
+        "## Columns of the segments (Parquet)\n\nOne row a rated clip, key `clip_id`. The file's metadata "
+        "`onedemo.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
+        "## Limits\n\n"
+        "- Names of raters are in the data. Replace them before you publish it, and ask the raters.\n"
+        "- Ratings are of one robot beside one video, at the speed of the page; they say nothing of others.\n"
+        "- A rating says how alike two movements look, not how good either is.\n",
+    ]
+    return "\n".join(parts)
+
+
+def _run(store: Store, entry: dict[str, Any]) -> str:
+    run = entry["id"]
+    people = {rater.name: rater for rater in store.raters()}
+    rows = rating_rows(store, run)
+    whole, each = quality(rows), quality_by_rater(rows)
+    left_out = store.left_out(run)
+    classes = map(str, range(1, 6))
+    heads = ("rater", "role", "ratings", *classes, "alpha", "same on repeats", "median s", "note")
+    lines = [_line(("all", "", *_figures(whole), ""))]
+    for rater, figures in each.items():
+        person = people[rater]
+        notes = [*figures.warnings, *(["left out of training"] if person.id in left_out else [])]
+        lines.append(_line((rater, person.role, *_figures(figures), "; ".join(notes))))
+    return (
+        f"### {run}\n\nDemonstration `{entry['demo']}` (SHA-256 `{entry['demo_sha256'][:16]}…`), seed "
+        f"{entry['seed']}, made {entry['created_at']} with onedemo {entry['version']}.\n\n"
+        + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n"
+    )  # fmt: skip
+
+
+def _figures(figures: Quality) -> list[str]:
+    shares = [f"{100 * share:.0f} %" for share in figures.shares]
+    alike = figures.agreement
+    alpha = "–" if alike.alpha is None else f"{alike.alpha:.2f}"
+    if alike.alpha is not None and alike.low is not None and alike.high is not None:
+        alpha += f" ({alike.low:.2f} to {alike.high:.2f}, {alike.clips} clips)"
+    same = "–" if figures.same is None else f"{100 * figures.same:.0f} % of {figures.repeats}"
+    seconds = "–" if figures.seconds is None else f"{figures.seconds:.1f}"
+    return [str(figures.ratings), *shares, alpha, same, seconds]
+
+
+def _line(cells: Any) -> str:
+    return f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in cells)} |\n"

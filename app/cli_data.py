@@ -1,0 +1,127 @@
+"""The commands for people and data: ``rater``, ``export``, ``import``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from trainer.errors import UserError
+from trainer.files import check_writable
+
+
+def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
+    """Adds them to the command line.
+
+    Args:
+        commands: Where sub-commands are added.
+        command: Adds one: (commands, name, function, summary).
+    """
+    rater = command(commands, "rater", None, "people and their links")
+    actions = rater.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=type(rater))
+    new = command(actions, "add", _rater_add, "a new rater; prints the link to send")
+    new.add_argument("name")
+    new.add_argument("--researcher", action="store_true", help="may watch, steer and export too")
+    new.add_argument("--url", default="http://127.0.0.1:8080", help="address people reach the page at")
+    people = command(actions, "list", _rater_list, "everybody")
+    revoke = command(actions, "revoke", _rater_revoke, "end a rater's links and sessions; ratings stay")
+    revoke.add_argument("name")
+    for parser in (new, people, revoke):
+        add_data_dir(parser)
+
+    export = command(commands, "export", _export, "the ratings as CSV, what was rated as Parquet")
+    add_data_dir(export)
+    export.add_argument("--out", type=Path, metavar="FILE", help="the CSV; standard output if not given")
+    export.add_argument("--run", dest="run_name", metavar="NAME", help="only this run")
+    export.add_argument("--rater", metavar="NAME", help="only this rater (of the CSV)")
+    export.add_argument("--segments", type=Path, metavar="FILE", help="states and actions behind the clips")
+    export.add_argument("--card", type=Path, metavar="FILE", help="the data card, in Markdown")
+
+    back = command(commands, "import", _import, "an export back into an empty data directory")
+    back.add_argument("ratings", type=Path, metavar="RATINGS.csv")
+    back.add_argument("segments", type=Path, metavar="SEGMENTS.parquet")
+    add_data_dir(back)
+
+
+def add_data_dir(parser: argparse.ArgumentParser) -> None:
+    """The option ``--data-dir``."""
+    parser.add_argument(
+        "--data-dir", type=Path, default=Path("data"), metavar="DIR", help="where everything is kept (./data)"
+    )
+
+
+def check_output(file: Path, data_dir: Path) -> None:
+    """Raises UserError, before any work is done, if a result could not be written there."""
+    check_writable(file)
+    if file.absolute().parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
+        raise UserError(f"{file} is the database; choose another name")
+
+
+def _rater_add(arguments: argparse.Namespace) -> None:
+    from app.links import issue_link, read_secret
+
+    name = arguments.name
+    if not 1 <= len(name.strip()) <= 64 or not name.isprintable():
+        raise UserError(f"a rater's name is 1 to 64 printable characters, got {name[:80]!r}")
+    with _open_store(arguments) as store:
+        rater = store.ensure_rater(name.strip(), "researcher" if arguments.researcher else "annotator")
+        print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
+
+
+def _rater_list(arguments: argparse.Namespace) -> None:
+    with _open_store(arguments, must_exist=True) as store:
+        for rater in store.raters():
+            print(f"{rater.name:24} {rater.role}")
+
+
+def _rater_revoke(arguments: argparse.Namespace) -> None:
+    with _open_store(arguments, must_exist=True) as store:
+        raters = {rater.name: rater for rater in store.raters()}
+        if arguments.name not in raters:
+            raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
+        ended = store.revoke_tokens(raters[arguments.name].id)
+        print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from app.card import card
+    from app.exports import csv_blocks, write_parquet
+    from trainer.files import write_atomic
+
+    with _open_store(arguments, must_exist=True) as store:
+        run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
+        if run is not None and run not in runs:
+            raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
+        for file in (arguments.out, arguments.segments, arguments.card):
+            if file is not None:
+                check_output(file, arguments.data_dir)
+        if arguments.segments is not None:
+            write_parquet(store, run, arguments.segments)
+        if arguments.card is not None:
+            write_atomic(arguments.card, card(store, run).encode())
+        blocks = csv_blocks(store.iter_ratings(run, rater=arguments.rater))
+        if arguments.out is not None:
+            write_atomic(arguments.out, blocks)
+        elif arguments.segments is None and arguments.card is None:
+            for block in blocks:
+                sys.stdout.buffer.write(block)
+            sys.stdout.buffer.flush()
+
+
+def _import(arguments: argparse.Namespace) -> None:
+    from app.importing import import_data
+
+    there = import_data(arguments.ratings, arguments.segments, arguments.data_dir)
+    print("  ".join(f"{count} {what}" for what, count in there.items()))
+
+
+def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
+    from contextlib import closing
+
+    from trainer.store import FILE_NAME, Store
+
+    if must_exist and not (arguments.data_dir / FILE_NAME).exists():
+        raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")
+    return closing(Store(arguments.data_dir))

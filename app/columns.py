@@ -1,0 +1,50 @@
+"""What is in an exported data set, column by column. The data card and the documentation are made of this."""
+
+from __future__ import annotations
+
+RATINGS: dict[str, str] = {
+    "id": "Number of the rating; ascending in time.",
+    "clip_id": "Clip that was rated; key of the segments.",
+    "run": "Training that the clip belongs to.",
+    "demo": "Name of the demonstration video.",
+    "rater": "Name of the rater.",
+    "value": "1 (not at all similar) to 5 (the same).",
+    "stage": "pretrain: random motion; online: the policy in training.",
+    "iteration": "Iteration of the policy whose motion the clip shows; 0 in pretrain.",
+    "created_at": "When the rating was given: UTC, ISO 8601, milliseconds.",
+    "latency_ms": "From the clip on screen to the press, milliseconds.",
+    "snapshot": "Newest predictor at that time; 0: none.",
+    "predicted": "What that predictor expected, 1 to 5; empty: none.",
+    "demo_step": "Control step of the demonstration at which the clip begins.",
+    "steps": "Length of the clip, control steps.",
+    "repeat": "1: the same person's second opinion, which nothing learns from; else 0.",
+    "mark_start": "Where the clip goes wrong, seconds from its start; empty: not said.",
+    "mark_end": "End of that stretch, seconds from the start of the clip.",
+    "choice": "Why the clip was asked: any, high (predicted rating), disagreement; empty: not kept.",
+    "score": "Predicted rating or disagreement that it was chosen by; empty: by chance.",
+    "left_out": "1: a researcher has left the rater out of training; else 0.",
+}
+"""Of the CSV, in order."""
+
+SEGMENTS: dict[str, str] = {
+    "clip_id": "Clip; key.",
+    "run": "Training that it belongs to.",
+    "demo_step": "Control step of the demonstration at which it begins.",
+    "stage": "pretrain or online.",
+    "iteration": "Iteration of the policy whose motion it shows.",
+    "snapshot": "Newest predictor when it was asked; 0: none.",
+    "predicted": "What that predictor expected, 1 to 5.",
+    "choice": "Why it was asked.",
+    "score": "What it was chosen by.",
+    "obs": "Observations before each step, as Gymnasium's Hopper-v5 has them: (steps, 11).",
+    "actions": "Actions as the policy gave them, not clipped: (steps, 3).",
+    "qpos": "Positions before each step, metres and radians: (steps, 6).",
+    "qvel": "Velocities before each step, metres/s and radians/s: (steps, 6).",
+}
+"""Of the Parquet file, in order; the last four are lists of rows."""
+
+
+def as_table(columns: dict[str, str]) -> str:
+    """Columns as a Markdown table."""
+    rows = "\n".join(f"| `{name}` | {meaning} |" for name, meaning in columns.items())
+    return f"| column | meaning |\n|---|---|\n{rows}\n"

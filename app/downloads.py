@@ -1,0 +1,142 @@
+"""What researchers take away over HTTP: ratings, segments, the data card; and a look at them before."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from html import escape
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from app import exports
+from app.card import card
+from app.columns import RATINGS
+from trainer.store import Store
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+FILTERS = ("run", "rater", "stage", "value", "choice", "repeat", "left_out")
+"""Columns of the ratings by which they can be filtered."""
+_NUMBERS = ("value", "repeat", "left_out")
+_SHOWN = 50
+"""Ratings in a preview."""
+
+
+class Downloads:
+    """Handlers for a front that lets researchers in alone.
+
+    Args:
+        store: Where the data is.
+        headers: Sent with everything.
+    """
+
+    def __init__(self, store: Store, headers: dict[str, str]) -> None:
+        self._store, self._headers = store, headers | {"Cache-Control": "no-store"}
+
+    def routes(self, guard: Callable[[Handler], Handler]) -> list[web.RouteDef]:
+        """Where they are. ``guard`` wraps each."""
+        handlers = {
+            "/export.csv": self._csv, "/segments.parquet": self._parquet, "/card.md": self._card,
+            "/preview": self._preview,
+        }  # fmt: skip
+        return [web.get(path, guard(handler)) for path, handler in handlers.items()]
+
+    async def _csv(self, request: web.Request) -> web.StreamResponse:
+        response = self._attachment("ratings", "csv", "text/csv")
+        await response.prepare(request)
+        blocks = exports.csv_blocks(self._store.iter_ratings(**read_filters(request.query)))
+        loop = asyncio.get_running_loop()
+        # One thread for the whole export: a SQLite connection belongs to the thread that opened it.
+        with ThreadPoolExecutor(max_workers=1) as reader:
+            try:
+                while block := await loop.run_in_executor(reader, next, blocks, None):
+                    await response.write(block)
+            finally:
+                await loop.run_in_executor(reader, blocks.close)
+        await response.write_eof()
+        return response
+
+    async def _parquet(self, request: web.Request) -> web.StreamResponse:
+        run = read_filters(request.query).get("run")
+        with tempfile.TemporaryDirectory() as directory:
+            file = Path(directory) / "segments.parquet"
+            await asyncio.to_thread(exports.write_parquet, self._store, run, file)
+            response = self._attachment("segments", "parquet", "application/vnd.apache.parquet")
+            await response.prepare(request)
+            with file.open("rb") as source:
+                while block := await asyncio.to_thread(source.read, 1 << 18):
+                    await response.write(block)
+            await response.write_eof()
+        return response
+
+    async def _card(self, request: web.Request) -> web.StreamResponse:
+        text = await asyncio.to_thread(card, self._store, read_filters(request.query).get("run"))
+        response = self._attachment("card", "md", "text/markdown")
+        await response.prepare(request)
+        await response.write(text.encode())
+        await response.write_eof()
+        return response
+
+    async def _preview(self, request: web.Request) -> web.StreamResponse:
+        filters = read_filters(request.query)
+        html = await asyncio.to_thread(self._table, filters)
+        return web.Response(text=html, content_type="text/html")
+
+    def _table(self, filters: dict[str, Any]) -> str:
+        rows = self._store.iter_ratings(**filters)
+        shown = list(islice(rows, _SHOWN))
+        more = sum(1 for _ in rows)
+        return preview_html(shown, len(shown) + more)
+
+    def _attachment(self, what: str, suffix: str, kind: str) -> web.StreamResponse:
+        response = web.StreamResponse(headers=dict(self._headers))
+        response.content_type = kind
+        if kind.startswith("text/"):
+            response.charset = "utf-8"
+        name = exports.file_name(what, suffix)
+        response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
+        return response
+
+
+def read_filters(query) -> dict[str, Any]:
+    """The filters in a query; empty ones are none.
+
+    Raises:
+        web.HTTPBadRequest: If one is unknown, or no number where one is wanted.
+    """
+    filters: dict[str, Any] = {}
+    for name, value in query.items():
+        if name not in FILTERS or len(value) > 200 or (name in _NUMBERS and value and not value.isdigit()):
+            raise web.HTTPBadRequest(text=f"Ratings cannot be filtered by {name[:40]!r} {value[:40]!r}.")
+        if value:
+            filters[name] = int(value) if name in _NUMBERS else value
+    return filters
+
+
+def preview_html(rows: list[tuple], count: int) -> str:
+    """The first of some ratings as a table.
+
+    Args:
+        rows: In the order of the columns.
+        count: How many there are in all.
+    """
+    if not rows:
+        return '<p class="od-quiet">There are no such ratings.</p>'
+    heads = "".join(f'<th scope="col" title="{escape(text)}">{name}</th>' for name, text in RATINGS.items())
+    body = "".join(f"<tr>{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    shown = f"the first {len(rows)} of {count:,}" if count > len(rows) else f"all {count:,}"
+    return (
+        f'<p class="od-quiet">{shown} ratings</p><div class="od-scroll" tabindex="0" role="region" '
+        f'aria-label="Preview"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g}" if isinstance(value, float) else escape(str(value))

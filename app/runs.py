@@ -1,0 +1,180 @@
+"""The Runs tab: all runs of the data directory, side by side; another one is opened or made here."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from app import charts
+from trainer.config import METHODS
+from trainer.demos import list_demos
+from trainer.records import Status
+
+if TYPE_CHECKING:
+    from app.session import Session
+
+_COMPARED = 6
+"""Runs whose curves are drawn at most."""
+
+
+class Runs:
+    """The Runs tab of one session."""
+
+    title = "Runs"
+
+    def __init__(self, session: Session) -> None:
+        page = session.page
+        self._store, self._run, self._trainer = page.trainer.store, page.trainer.run, page.trainer
+        self._lock = threading.RLock()
+        self._shown = False
+        self._rows: dict[str, list[dict]] = {}
+        self._told = ""
+        gui = session.client.gui
+        self._table = gui.add_html("")
+        self._chosen = {
+            run: gui.add_checkbox(run, initial_value=True)
+            for run in [entry["id"] for entry in self._store.runs()][-_COMPARED:]
+        }
+        for box in self._chosen.values():
+            box.on_update(lambda _: self._draw_curves())
+        gui.add_html('<div class="od-break"></div>')
+        self._curves = [
+            charts.Comparison(gui, key, title, dark=session.dark, runs=list(self._chosen))
+            for key, title in (
+                ("predicted", "Predicted rating (1 to 5) by control steps"),
+                ("true_reward", "True reward of an episode by control steps (never trained on)"),
+            )
+        ]
+        demos_dir = page.trainer.data_dir / "demos"
+        gui.add_html(new_run_html([demo.name for demo in list_demos(demos_dir)], list(self._chosen)))
+
+    def show(self) -> None:
+        """Lists the runs."""
+        with self._lock:
+            self._shown = True
+            self.refresh(self._trainer.status())
+
+    def hide(self) -> None:
+        """Stops following."""
+        self._shown = False
+
+    def refresh(self, status: Status) -> None:
+        """Follows the run at hand."""
+        with self._lock:
+            if not self._shown:
+                return
+            grown = False
+            for run in self._chosen:
+                rows = self._rows.setdefault(run, [])
+                if run == self._run or not rows:
+                    new = self._store.iterations(run, after=rows[-1]["number"] if rows else 0)
+                    rows += new
+                    grown |= bool(new)
+            told = runs_html(self._store.runs(), self._figures(), self._run, status)
+            if told != self._told:
+                self._told = self._table.content = told
+            if grown:
+                self._draw_curves()
+
+    def close(self) -> None:
+        """Nothing to do: it holds nothing."""
+
+    def _draw_curves(self) -> None:
+        with self._lock:
+            shown = {run: rows for run, rows in self._rows.items() if self._chosen[run].value}
+            for curve in self._curves:
+                curve.draw(shown)
+
+    def _figures(self) -> dict[str, dict[str, Any]]:
+        figures = {}
+        for run in self._store.runs():
+            name = run["id"]
+            rows = self._rows.get(name)
+            last = rows[-1] if rows else (self._store.last_iteration(name) or {})
+            figures[name] = {"ratings": sum(self._store.ratings_by_class(name)), **last}
+        return figures
+
+
+def runs_html(
+    runs: Sequence[Mapping[str, Any]], figures: Mapping[str, Mapping[str, Any]], current: str, status: Status
+) -> str:
+    """The table of runs, the newest first.
+
+    Args:
+        runs: As ``Store.runs``.
+        figures: Of each: ``ratings``, and the newest iteration's.
+        current: The one that is served.
+        status: Of that one.
+    """
+    heads = (
+        "Run", "Demonstration", "Method", "Seed", "Ratings", "Iterations", "Control steps",
+        "Predicted rating", "True reward", "",
+    )  # fmt: skip
+    rows = ""
+    for run in reversed(runs):
+        name, row = run["id"], figures[run["id"]]
+        here = name == current
+        what = f'data-do="open run" data-run="{escape(name)}"'
+        action = f'<button type="button" class="od-button od-small" {what}>Open</button>'
+        if here:
+            action = f"<b>{escape(status.phase)}</b>"
+        cells = (
+            escape(run["demo"]), escape(method_of(run["config"])), run["seed"], row["ratings"],
+            f"{row['number']:,}" if "number" in row else "–",
+            charts.short(row["env_steps"]) if "env_steps" in row else "–",
+            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), ""), action,
+        )  # fmt: skip
+        made = f"made {run['created_at'][:16].replace('T', ' ')} UTC"
+        rows += (
+            f'<tr{" class=od-current" if here else ""}>'
+            f'<th scope="row" title="{escape(made)}">{escape(name)}</th>'
+            + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+        )  # fmt: skip
+    head = "".join(f'<th scope="col">{text}</th>' for text in heads)
+    return (
+        '<article class="od-data od-runs"><div class="od-data-top"><div><h1>Runs</h1>'
+        "<p>One at a time is trained and rated. Opening another stops this one after its iteration; nothing "
+        "is lost.</p></div></div>"
+        '<section><div class="od-scroll" tabindex="0" role="region" aria-label="Runs">'
+        f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
+        "<h2>Compare</h2></article>"
+    )
+
+
+def new_run_html(demos: Sequence[str], runs: Sequence[str]) -> str:
+    """The form for a new run. Drawn once, so that nothing that is being filled in is lost."""
+
+    def options(values: Sequence[str], first: str = "") -> str:
+        return first + "".join(f"<option>{escape(value)}</option>" for value in values)
+
+    nothing = '<option value="">nothing</option>'
+    return (
+        '<article class="od-data od-new-run"><section><h3>New run</h3>'
+        '<form class="od-filter" data-act="new run">'
+        f'<label>Demonstration <select name="demo">{options(demos)}</select></label>'
+        f'<label>Method <select name="method">{options(list(METHODS))}</select></label>'
+        '<label>Seed <input name="seed" type="number" min="0" max="999999" value="0" required></label>'
+        '<label>Name <input name="name" maxlength="64" placeholder="by itself"></label>'
+        '<label>Predictor starts from <select name="predictor_from">'
+        f"{options(runs, nothing)}</select></label>"
+        '<button class="od-button od-primary">Start</button></form>'
+        '<p class="od-form-note" role="status"></p>'
+        "<p class=od-quiet>A run that starts from another’s predictor keeps what raters looked at there; it "
+        "must be of the same method.</p></section></article>"
+    )
+
+
+def method_of(config: str) -> str:
+    """The method in a run's settings; runs of before there were two are the paper's."""
+    for line in config.splitlines():
+        if line.startswith("method = "):
+            return line.partition('"')[2].rstrip('"')
+    return "paper"
+
+
+def _figure(value: float | None, unit: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:,.1f} <small>{unit}</small>" if unit else f"{value:,.0f}"

@@ -1,0 +1,148 @@
+"""The runs of one data directory, one of which is served: opened, made, stopped for another."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from trainer.config import METHODS, RunConfig, load_config
+from trainer.demos import find_demo
+from trainer.encoders import make_encoder
+from trainer.errors import UserError
+from trainer.files import hold
+from trainer.loop import Trainer
+from trainer.records import Demo
+from trainer.render import RenderThread
+from trainer.runs import add_run, find_run
+from trainer.store import Store
+from trainer.transfer import newest_snapshot
+
+
+class Study:
+    """What a researcher may do with runs. Safe to use from many threads; one change at a time.
+
+    Args:
+        store: Of the data directory.
+        data_dir: Everything is kept there.
+        renderer: Draws clips; shared by all runs, not closed here.
+        encoder_weights: Weights of the encoder, if not its own.
+        device: Where predictor and policy compute.
+        served: Called with the trainer whenever another run is served.
+    """
+
+    trainer: Trainer
+    """Of the run that is served."""
+
+    def __init__(
+        self, store: Store, data_dir: Path, renderer: RenderThread, *, encoder_weights: Path | None = None,
+        device: str = "cpu", served: Callable[[Trainer], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self._store, self._data_dir, self._renderer = store, data_dir, renderer
+        self._encoder_weights, self._device = encoder_weights, device
+        self.served = served
+        self._held = ExitStack()
+        self._change = threading.Lock()
+
+    def serve(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
+        """Serves a run that is recorded, from now on; the thread that trains it has to be started.
+
+        Args:
+            run: Its name.
+            demo: What is to be learned.
+            config: Its settings.
+            start: Snapshot of another run that its predictor starts from.
+
+        Raises:
+            UserError: If another process works on it, or its encoder cannot be had.
+        """
+        encoder = make_encoder(config.encoder, self._encoder_weights)
+        directory = self._data_dir / "runs" / run
+        held = ExitStack()
+        held.enter_context(hold(directory / "lock"))
+        held.enter_context(_log_to(directory / "log"))
+        trainer = Trainer(
+            store=self._store, data_dir=self._data_dir, run=run, demo=demo,
+            config=replace(config, device=self._device), encoder=encoder, renderer=self._renderer,
+            start=start,
+        )  # fmt: skip
+        self._held, before = held, self._held
+        self.trainer = trainer
+        before.close()
+        self.served(trainer)
+
+    def open(self, run: str) -> None:
+        """Stops the run at hand after its iteration, and goes on with another.
+
+        Raises:
+            UserError: If there is no such run, or it cannot be gone on with; then all stays as it is.
+        """
+        with self._change:
+            if run == self.trainer.run:
+                raise UserError(f"run {run!r} is being served already")
+            known = {entry["id"]: entry for entry in self._store.runs()}
+            if run not in known:
+                raise UserError(f"no run {run!r}; there are: {', '.join(known)}")
+            demo = find_demo(known[run]["demo"], self._data_dir / "demos")
+            found = find_run(self._store, self._data_dir, demo, name=run, wanted=None)
+            assert found is not None
+            self._switch(run, demo, found[1])
+
+    def create(
+        self, *, demo: str, method: str, seed: int, name: str | None = None, predictor_from: str | None = None
+    ) -> str:
+        """Makes a run and serves it; returns its name.
+
+        Args:
+            demo: What is to be learned.
+            method: "onedemo" or "paper".
+            seed: Of everything random.
+            name: What to call it; None: the demo's name and a number.
+            predictor_from: Run from whose predictor it starts.
+
+        Raises:
+            UserError: If something of it cannot be; then all stays as it is.
+        """
+        with self._change:
+            if method not in METHODS:
+                raise UserError(f"there is no method {method!r}; choose from: {', '.join(METHODS)}")
+            config = load_config(None, {"method": method, "seed": seed, "device": self._device})
+            start = None
+            if predictor_from is not None:
+                start = newest_snapshot(self._store, self._data_dir, predictor_from)
+            found = find_demo(demo, self._data_dir / "demos")
+            run = add_run(self._store, self._data_dir, found, config, name=name)
+            self._switch(run, found, config, start=start)
+            return run
+
+    def close(self) -> None:
+        """Stops the run at hand."""
+        self.trainer.stop()
+        self._held.close()
+
+    def _switch(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
+        self.trainer.stop()
+        try:
+            self.serve(run, demo, config, start=start)
+        except BaseException:
+            self.trainer.start()
+            raise
+        self.trainer.start()
+
+
+@contextmanager
+def _log_to(file: Path) -> Iterator[None]:
+    """Writes the log into a file for as long as the block lasts."""
+    handler = logging.FileHandler(file)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger = logging.getLogger("onedemo")
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
