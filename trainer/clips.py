@@ -27,34 +27,36 @@ _MOST_ROWS = 40
 """Of the grid: browsers draw no picture higher than 16,384 pixels."""
 
 
-def compose_clip(demo_frames: np.ndarray, agent_frames: np.ndarray) -> bytes:
-    """Lays the frames side by side, pair below pair, and encodes them as one JPEG.
+def compose_clip(demo_frames: np.ndarray, *agent_frames: np.ndarray) -> bytes:
+    """Lays the frames side by side, moment below moment, and encodes them as one JPEG.
 
     Args:
         demo_frames: The demo's frames, (k, H, W, 3), uint8 RGB, any size.
-        agent_frames: The agent's frames at the same times, (k, H', W', 3), uint8 RGB, any size.
+        agent_frames: Frames of one agent or more at the same times, (k, H', W', 3), uint8 RGB, any size.
 
     Returns:
-        The file's bytes: pairs of 972 x 360 pixels, row by row, in one column as long as it is not too high.
+        The file's bytes: of one agent, 972 x 360 pixels a moment, row by row, in one column as long as it
+        is not too high.
 
     Raises:
         ValueError: If the sides differ in length, are empty or not RGB.
     """
-    for side, frames in (("demo", demo_frames), ("agent", agent_frames)):
+    for side, frames in (("demo", demo_frames), *(("agent", frames) for frames in agent_frames)):
         if frames.ndim != 4 or frames.shape[3] != 3 or frames.dtype != np.uint8 or not frames.size:
             raise ValueError(
                 f"{side} frames must be (k, H, W, 3) uint8 with k > 0, got {frames.shape} {frames.dtype}"
             )
-    if len(demo_frames) != len(agent_frames):
-        raise ValueError(f"{len(demo_frames)} demo frames, but {len(agent_frames)} agent frames")
+        if len(frames) != len(demo_frames):
+            raise ValueError(f"{len(demo_frames)} demo frames, but {len(frames)} agent frames")
     columns = math.ceil(len(demo_frames) / _MOST_ROWS)
     rows = math.ceil(len(demo_frames) / columns)
-    picture = np.full((rows * CLIP_HEIGHT, columns * CLIP_WIDTH, 3), 255, np.uint8)
+    width = SIDE_WIDTH + len(agent_frames) * (SIDE_WIDTH + GAP)
+    picture = np.full((rows * SIDE_HEIGHT, columns * width, 3), 255, np.uint8)
     for cell in range(rows * columns):  # those left over show the last frame
         frame = min(cell, len(demo_frames) - 1)
-        y, x = cell // columns * CLIP_HEIGHT, cell % columns * CLIP_WIDTH
-        pair = side_by_side(demo_frames[frame], agent_frames[frame])
-        picture[y : y + CLIP_HEIGHT, x : x + CLIP_WIDTH] = pair
+        y, x = cell // columns * SIDE_HEIGHT, cell % columns * width
+        moment = side_by_side(demo_frames[frame], *(frames[frame] for frames in agent_frames))
+        picture[y : y + SIDE_HEIGHT, x : x + width] = moment
     options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
     done, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
     if not done:
@@ -74,10 +76,10 @@ def frame_durations(k: int, fps: float) -> np.ndarray:
     return durations
 
 
-def side_by_side(demo: np.ndarray, agent: np.ndarray) -> np.ndarray:
-    """One picture of both, (H, W, 3), each fitted into its side."""
+def side_by_side(demo: np.ndarray, *agents: np.ndarray) -> np.ndarray:
+    """One picture of all, (H, W, 3), each fitted into its side."""
     gap = np.full((SIDE_HEIGHT, GAP, 3), 255, np.uint8)
-    return np.concatenate([fit(demo), gap, fit(agent)], axis=1)
+    return np.concatenate([fit(demo), *(part for agent in agents for part in (gap, fit(agent)))], axis=1)
 
 
 def fit(frame: np.ndarray) -> np.ndarray:

@@ -242,6 +242,48 @@ STEPS: tuple[str, ...] = (
             WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
         );
     """,
+    # 4: pairs of clips, and which of the two is nearer to the demo.
+    """
+    CREATE TABLE pairs (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        run TEXT NOT NULL REFERENCES runs (id),
+        demo_step INTEGER NOT NULL,     -- control step of the demo at which both clips begin
+        steps INTEGER NOT NULL,         -- length in control steps
+        stage TEXT NOT NULL CHECK (stage IN ('pretrain', 'online')),
+        iteration INTEGER NOT NULL,     -- whose rollouts they were cut from
+        left_segment BLOB NOT NULL,     -- as in segments
+        right_segment BLOB NOT NULL,
+        state TEXT NOT NULL DEFAULT 'cut' CHECK (state IN ('cut', 'ready', 'withdrawn')),
+        created_at TEXT NOT NULL
+    );
+    CREATE INDEX pairs_by_run ON pairs (run, state, id);
+    -- Append-only. The last answer of a rater on a pair is the one that holds.
+    CREATE TABLE comparisons (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        pair_id INTEGER NOT NULL REFERENCES pairs (id),
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        answer TEXT NOT NULL CHECK (answer IN ('left', 'right', 'equal', 'skip', 'undo')),
+        latency_ms INTEGER NOT NULL,
+        created_at TEXT NOT NULL
+    );
+    CREATE INDEX comparisons_by_pair ON comparisons (pair_id, rater_id, id);
+    CREATE TRIGGER comparisons_keep_update BEFORE UPDATE ON comparisons
+        BEGIN SELECT RAISE(ABORT, 'comparisons are append-only'); END;
+    CREATE TRIGGER comparisons_keep_delete BEFORE DELETE ON comparisons
+        BEGIN SELECT RAISE(ABORT, 'comparisons are append-only'); END;
+    -- The answers that hold, one row each; skipped pairs are none.
+    CREATE VIEW answers AS
+        SELECT c.id, c.pair_id, p.run, r.demo, a.name AS rater, c.answer, p.stage, p.iteration, c.created_at,
+               c.latency_ms, p.demo_step, p.steps
+        FROM comparisons c
+        JOIN pairs p ON p.id = c.pair_id
+        JOIN runs r ON r.id = p.run
+        JOIN raters a ON a.id = c.rater_id
+        WHERE c.answer IN ('left', 'right', 'equal') AND NOT EXISTS (
+            SELECT 1 FROM comparisons l
+            WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id AND l.id > c.id
+        );
+    """,
 )
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -37,9 +38,11 @@ from trainer.baselines.scores import Score, judge, save_training
 from trainer.config import split_ratings
 from trainer.errors import UserError
 from trainer.hidden import HiddenStates
+from trainer.pairs import COMPARISON_COLUMNS
 from trainer.policy import Policy, PolicyConfig
 from trainer.priority import cores
 from trainer.rollouts import Collector, Transitions, evaluate
+from trainer.store import Store
 from trainer.trpo import Trpo, TrpoConfig
 
 
@@ -131,11 +134,14 @@ class PreferencesResult:
     """The final policy's evaluated episode of the highest hand-coded reward."""
 
 
-def train_preferences(config: PreferencesConfig, *, progress: bool = True) -> PreferencesResult:
+def train_preferences(
+    config: PreferencesConfig, *, given: Sequence[Comparison] = (), progress: bool = True
+) -> PreferencesResult:
     """Trains a policy from comparisons of what it does.
 
     Args:
         config: The training.
+        given: Answers that people gave before: then nobody is asked, and these are all.
         progress: Show a progress bar on standard error.
 
     Returns:
@@ -148,8 +154,11 @@ def train_preferences(config: PreferencesConfig, *, progress: bool = True) -> Pr
     collector = Collector(_make_env(config), seed=config.seed)
     rng = np.random.default_rng(np.random.SeedSequence(config.seed).spawn(2)[1])
     comparer = Comparer(budget=config.pretrain + config.online)
-    comparisons: list[Comparison] = []
-    reward, fit = _pretrain(config, comparer, comparisons, rng)
+    comparisons = list(given)
+    if given:
+        reward, fit = fit_reward(comparisons, config.reward, seed=config.seed)
+    else:
+        reward, fit = _pretrain(config, comparer, comparisons, rng)
     per_iteration = config.lanes * config.batch
     iterations = -(-config.steps // per_iteration)
     curve: list[PreferencesScore] = []
@@ -163,6 +172,7 @@ def train_preferences(config: PreferencesConfig, *, progress: bool = True) -> Pr
             steps = iteration * per_iteration
             correlation = agreement(rollouts, rewards, config.segment_steps)
             due = comparisons_due(config, steps, last=(iterations - 1) * per_iteration) - comparer.given
+            due = 0 if given else due
             asked = _ask(config, comparer, reward, rollouts, due, rng)
             if asked:
                 comparisons += asked
@@ -176,7 +186,7 @@ def train_preferences(config: PreferencesConfig, *, progress: bool = True) -> Pr
                 curve.append(
                     PreferencesScore(
                         **asdict(score),
-                        comparisons=comparer.given,
+                        comparisons=len(comparisons),
                         correlation=correlation,
                         unseen_accuracy=fit.unseen_accuracy,
                     )
@@ -184,13 +194,32 @@ def train_preferences(config: PreferencesConfig, *, progress: bool = True) -> Pr
                 bar.set_postfix(
                     reward=round(score.reward_mean),
                     turns=round(score.net_turns_mean, 1),
-                    comparisons=comparer.given,
+                    comparisons=len(comparisons),
                     correlation=round(correlation, 2),
                     std=round(stats.std, 2),
                 )
     collector.env.close()
     assert episode is not None
     return PreferencesResult(config=config, curve=tuple(curve), final=policy, reward=reward, episode=episode)
+
+
+def stored_comparisons(store: Store, run: str) -> list[Comparison]:
+    """What people said of the pairs of a run, for ``train_preferences``.
+
+    Raises:
+        UserError: If there is no such run, or nothing was compared in it.
+    """
+    runs = [entry["id"] for entry in store.runs()]
+    if run not in runs:
+        raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
+    preference = {"left": 1.0, "right": 0.0, "equal": 0.5}
+    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.iter_comparisons(run)]
+    if not rows:
+        raise UserError(f"nobody has compared anything in run {run!r}; do so on the page's Compare tab")
+    return [
+        Comparison(pair=store.pair_segments(row["pair_id"]), preference=preference[row["answer"]])
+        for row in rows
+    ]
 
 
 def save_preferences(prefix: Path, result: PreferencesResult) -> None:

@@ -1,0 +1,108 @@
+"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``app.desk``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Hashable
+
+from app.assignment import Assignment
+from app.desk import GUARD_SECONDS
+from trainer.records import Rater
+from trainer.store import Store
+
+
+class PairDesk:
+    """One rater before pairs.
+
+    Args:
+        store: Where answers go.
+        run: The run whose pairs are compared.
+        rater: Who compares.
+        assignment: Shared by all pages of the run; of pairs alone.
+        holder: Names this page to the assignment.
+        clock: Seconds; replaced in tests.
+    """
+
+    def __init__(
+        self, store: Store, run: str, rater: Rater, assignment: Assignment, holder: Hashable,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._store, self._run, self._rater = store, run, rater
+        self._assignment, self._holder, self._clock = assignment, holder, clock
+        self._lock = threading.RLock()
+        self._done: list[int] = []
+        self._shown_at = 0.0
+        self.current: int | None = None
+        """The pair on screen, None while there is none."""
+        self.upcoming: int | None = None
+        """The pair after it, to be fetched ahead."""
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is an answer of this page to take back."""
+        return bool(self._done)
+
+    def refill(self) -> bool:
+        """Looks for pairs if none is on screen or at hand; returns whether anything changed."""
+        with self._lock:
+            before = self.current, self.upcoming
+            if self.current is None:
+                self._advance()
+            elif self.upcoming is None:
+                self.upcoming = self._pick()
+            return before != (self.current, self.upcoming)
+
+    def answer(self, pair: int, answer: str) -> bool:
+        """Commits what is said of the pair that was on screen and moves on.
+
+        Returns:
+            False if the press counts for nothing.
+
+        Raises:
+            sqlite3.Error: If it could not be committed; the pair stays.
+        """
+        with self._lock:
+            seconds = self._clock() - self._shown_at
+            if pair != self.current or seconds < GUARD_SECONDS:
+                return False
+            self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
+            self._done.append(pair)
+            self._assignment.release(self._holder, pair)
+            self._advance()
+            return True
+
+    def undo(self) -> bool:
+        """Takes the last answer back and shows its pair again; False if there is none.
+
+        Raises:
+            sqlite3.Error: If it could not be committed.
+        """
+        with self._lock:
+            if not self._done:
+                return False
+            self._store.compare(self._done[-1], self._rater.id, "undo", 0)
+            pair = self._done.pop()
+            self.upcoming = self.current or self.upcoming
+            self._show(pair)
+            return True
+
+    def close(self) -> None:
+        """Frees the pairs this page held."""
+        self._assignment.release(self._holder)
+
+    def _advance(self) -> None:
+        pair, self.current = self.upcoming, None
+        waiting = {pair.id for pair in self._store.waiting_pairs(self._run)}
+        self._show(pair if pair in waiting else self._pick())
+        self.upcoming = self._pick() if self.current is not None else None
+
+    def _pick(self) -> int | None:
+        waiting = [pair.id for pair in self._store.waiting_pairs(self._run)]
+        avoid = () if self.current is None else (self.current,)
+        return self._assignment.take(self._holder, waiting, now=self._clock(), avoid=avoid)
+
+    def _show(self, pair: int | None) -> None:
+        self.current, self._shown_at = pair, self._clock()
+        if pair is not None:
+            self._assignment.hold(self._holder, pair, now=self._shown_at)

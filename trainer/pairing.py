@@ -1,0 +1,141 @@
+"""Makes pairs for people to compare, while somebody looks: cut from the newest rollouts and drawn.
+
+Shapes: N lanes, T control steps, W control steps a clip.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from trainer.choice import choose
+from trainer.clips import compose_clip
+from trainer.files import write_atomic
+from trainer.learner import Learner
+from trainer.pairs import NewPair, Pair
+from trainer.records import Rollouts
+from trainer.render import Renderer, RenderThread
+from trainer.rollouts import Transitions
+from trainer.store import Store
+
+log = logging.getLogger("onedemo")
+
+_QUEUE = 6
+_WANTED_S = 10.0
+"""Pairs are made for so long after somebody looked last."""
+_NEAR = 8
+"""Control steps that the clocks of a pair's clips may differ."""
+
+
+class Pairing:
+    """The pairs of one run.
+
+    Args:
+        store: Holds them.
+        run: Name of the run.
+        directory: Takes their pictures.
+        frames: The demo's frames, (F, H, W, 3), uint8.
+        renderer: Draws; not closed here.
+        seed: Of what is drawn by lot.
+    """
+
+    def __init__(
+        self, store: Store, run: str, directory: Path, frames: np.ndarray, renderer: RenderThread, seed: int
+    ) -> None:
+        self._store, self._run, self._directory = store, run, directory
+        self._frames, self._renderer = frames, renderer
+        self._rng = np.random.default_rng([seed, 1207])
+        self._wanted_until = 0.0
+
+    def want(self) -> None:
+        """Somebody looks; any thread may say so."""
+        self._wanted_until = time.monotonic() + _WANTED_S
+
+    def file(self, pair_id: int) -> Path:
+        """The picture of a pair: demo, left, right; it is there once the pair is "ready"."""
+        return self._directory / f"{pair_id:06d}.jpg"
+
+    def fill(self, learner: Learner, pool: Transitions | None) -> None:
+        """Cuts what is missing from the queue, if somebody looks, and has it drawn."""
+        if pool is None or time.monotonic() > self._wanted_until:
+            return
+        stale = [p.id for p in self._store.waiting_pairs(self._run) if p.iteration < learner.iteration - _OLD]
+        self._store.set_pair_state(stale, "withdrawn")
+        waiting = [p for state in ("ready", "cut") for p in self._store.waiting_pairs(self._run, state)]
+        drawn = draw_pairs(
+            pool, _QUEUE - len(waiting), learner.clip_steps, learner.demo_steps, self._rng,
+            any_time=learner.config.ratings.pairing == "any" and learner.iteration == 0,
+        )  # fmt: skip
+        new = [
+            NewPair(
+                demo_step=demo_step,
+                left=pool.segment(*left, learner.clip_steps),
+                right=pool.segment(*right, learner.clip_steps),
+                stage="pretrain" if learner.iteration == 0 else "online",
+                iteration=learner.iteration,
+            )
+            for demo_step, left, right in drawn
+        ]
+        for pair in self._store.add_pairs(self._run, new):
+            self._submit(pair, learner.frames_of)
+
+    def _submit(self, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
+        self._renderer.submit(lambda renderer: self._make(renderer, pair, frames_of))
+
+    def _make(self, renderer: Renderer, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
+        try:
+            left, right = self._store.pair_segments(pair.id)
+            index, first = np.unique(frames_of(pair.demo_step + np.arange(pair.steps)), return_index=True)
+            robots = [renderer.render(segment.qpos[first]) for segment in (left, right)]
+            write_atomic(self.file(pair.id), compose_clip(self._frames[index], *robots))
+            self._store.set_pair_state([pair.id], "ready")
+        except Exception:
+            log.exception("pair %d could not be drawn", pair.id)
+            self._store.set_pair_state([pair.id], "withdrawn")
+
+
+_OLD = 10
+"""Iterations after which a pair that nobody answered is withdrawn."""
+
+Place = tuple[int, int]
+"""Lane and first step."""
+
+
+def draw_pairs(
+    rollouts: Rollouts, count: int, clip_steps: int, demo_steps: int, rng: np.random.Generator, *,
+    any_time: bool,
+) -> list[tuple[int, Place, Place]]:  # fmt: skip
+    """Pairs of clips beside the same moment of the demo, uniformly.
+
+    Args:
+        rollouts: What the agent did, (N, T).
+        count: How many pairs.
+        clip_steps: W.
+        demo_steps: Control steps of the demo.
+        rng: Decides.
+        any_time: Any two clips may be a pair, beside any moment; else both are within a few steps of it.
+
+    Returns:
+        Demo step, left and right of each; fewer if there are not enough.
+    """
+    if count <= 0:
+        return []
+    asked = choose(rollouts, 40 * count, clip_steps, demo_steps, rng, any_time=any_time, how="uniform")
+    pairs: list[tuple[int, Place, Place]] = []
+    used: set[int] = set()
+    for i, left in enumerate(asked):
+        if len(pairs) == count:
+            break
+        for j in range(i + 1, len(asked)):
+            right = asked[j]
+            near = any_time or abs(left.demo_step - right.demo_step) <= _NEAR
+            if i in used or j in used or not near:
+                continue
+            used |= {i, j}
+            pairs.append((left.demo_step, (left.lane, left.start), (right.lane, right.start)))
+            break
+    return pairs

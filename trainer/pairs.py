@@ -1,0 +1,144 @@
+"""Pairs in the database: two clips of the robot beside one moment of the demo, and which one is nearer.
+
+The questions of learning from preferences (``trainer/baselines/preferences.py``). Answers are append-only
+events, like ratings, in a table of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from trainer.database import Database, now
+from trainer.records import Segment
+from trainer.segments import pack_segment, unpack_segment
+
+ANSWERS = ("left", "right", "equal")
+"""What may be said of a pair, besides skipping it."""
+COMPARISON_COLUMNS = (
+    "id", "pair_id", "run", "demo", "rater", "answer", "stage", "iteration", "created_at", "latency_ms",
+    "demo_step", "steps",
+)  # fmt: skip
+"""Columns of the view ``answers``, in order."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NewPair:
+    """A pair that has no number yet."""
+
+    demo_step: int
+    left: Segment
+    right: Segment
+    stage: str
+    iteration: int
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Pair:
+    """Two clips of W control steps beside the demo from ``demo_step`` on."""
+
+    id: int
+    demo_step: int
+    steps: int
+    iteration: int
+
+
+class Pairs(Database):
+    """Pairs and what was said of them."""
+
+    def add_pairs(self, run: str, pairs: Sequence[NewPair]) -> list[Pair]:
+        """Stores pairs with their segments, all or none."""
+        with self.transaction() as db:
+            added = []
+            for pair in pairs:
+                cursor = db.execute(
+                    "INSERT INTO pairs (run, demo_step, steps, stage, iteration, left_segment, right_segment,"
+                    " created_at) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    (run, pair.demo_step, len(pair.left), pair.stage, pair.iteration,
+                     pack_segment(pair.left), pack_segment(pair.right), now()),
+                )  # fmt: skip
+                assert cursor.lastrowid is not None
+                added.append(
+                    Pair(
+                        id=cursor.lastrowid, demo_step=pair.demo_step, steps=len(pair.left),
+                        iteration=pair.iteration,
+                    )
+                )  # fmt: skip
+            return added
+
+    def set_pair_state(self, pair_ids: Sequence[int], state: str) -> None:
+        """Moves pairs to "cut" (no picture yet), "ready" (may be shown) or "withdrawn" (too old)."""
+        with self.transaction() as db:
+            db.executemany("UPDATE pairs SET state = ? WHERE id = ?", [(state, i) for i in pair_ids])
+
+    def waiting_pairs(self, run: str, state: str = "ready") -> list[Pair]:
+        """Pairs in that state of which nobody has said anything that holds, oldest first."""
+        rows = self.rows(
+            "SELECT id, demo_step, steps, iteration FROM pairs p WHERE run = ? AND state = ? AND NOT EXISTS ("
+            " SELECT 1 FROM comparisons c WHERE c.pair_id = p.id AND c.answer != 'undo' AND NOT EXISTS ("
+            "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
+            "  AND l.id > c.id)) ORDER BY id",
+            (run, state),
+        )
+        return [Pair(id=i, demo_step=d, steps=s, iteration=k) for i, d, s, k in rows]
+
+    def pair_run(self, pair_id: int) -> str | None:
+        """The run of a pair; None if there is no such pair."""
+        rows = self.rows("SELECT run FROM pairs WHERE id = ?", (pair_id,))
+        return rows[0][0] if rows else None
+
+    def pair_segments(self, pair_id: int) -> tuple[Segment, Segment]:
+        """Left and right of a pair.
+
+        Raises:
+            KeyError: If there is no such pair.
+        """
+        rows = self.rows("SELECT left_segment, right_segment FROM pairs WHERE id = ?", (pair_id,))
+        if not rows:
+            raise KeyError(f"no pair {pair_id}")
+        return unpack_segment(rows[0][0]), unpack_segment(rows[0][1])
+
+    def compare(self, pair_id: int, rater_id: int, answer: str, latency_ms: int) -> int:
+        """Commits what a rater says of a pair and returns the event's number.
+
+        Args:
+            pair_id: The pair.
+            rater_id: Who says it.
+            answer: One of ``ANSWERS``, "skip", or "undo": takes back what the rater said of it.
+            latency_ms: From the pair on screen to the press.
+
+        Raises:
+            ValueError: If it is no answer, there is no such pair, the rater's answer holds already or
+                there is none to take back.
+        """
+        if answer not in (*ANSWERS, "skip", "undo"):
+            raise ValueError(f"a pair is {', '.join(ANSWERS)} or skipped, not {answer!r}")
+        with self.transaction() as db:
+            rows = db.execute(
+                "SELECT (SELECT answer FROM comparisons WHERE pair_id = p.id AND rater_id = ?"
+                "  ORDER BY id DESC LIMIT 1) FROM pairs p WHERE p.id = ?",
+                (rater_id, pair_id),
+            ).fetchall()
+            if not rows:
+                raise ValueError(f"no pair {pair_id}")
+            holds = rows[0][0] not in (None, "undo")
+            if holds != (answer == "undo"):
+                raise ValueError(f"pair {pair_id} is answered already" if holds else "nothing to take back")
+            cursor = db.execute(
+                "INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
+                " VALUES (?, ?, ?, ?, ?)",
+                (pair_id, rater_id, answer, max(0, int(latency_ms)), now()),
+            )
+            assert cursor.lastrowid is not None
+            return cursor.lastrowid
+
+    def count_comparisons(self, run: str) -> int:
+        """How many answers hold in a run."""
+        return self.rows("SELECT COUNT(*) FROM answers WHERE run = ?", (run,))[0][0]
+
+    def iter_comparisons(self, run: str | None = None) -> Iterator[tuple]:
+        """Rows of the view ``answers`` in order of their number, streamed."""
+        return self.stream(
+            f"SELECT {', '.join(COMPARISON_COLUMNS)} FROM answers WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
+            (run,),
+        )
