@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from app.columns import RATINGS, SEGMENTS, as_table
+from app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
 from app.quality import Quality, quality, quality_by_rater, rating_rows
 from app.words import ANSWERS
 from trainer.runs import program_version
@@ -39,6 +39,8 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         "spreadsheet would take for a formula begins with an apostrophe.\n\n" + as_table(RATINGS),
         "## Columns of the segments (Parquet)\n\nOne row a rated clip, key `clip_id`. The file's metadata "
         "`onedemo.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
+        "## Columns of the comparisons (CSV)\n\nAnswers to *Which of the two is nearer to the video?*\n\n"
+        + as_table(COMPARISONS),
         "## Limits\n\n"
         "- Names of raters are in the data. Replace them before you publish it, and ask the raters.\n"
         "- Ratings are of one robot beside one video, at the speed of the page; they say nothing of others.\n"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from app.bench import add_commands
-from app.cli_data import add_data_commands, add_data_dir, check_output
+from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
 from trainer.errors import UserError
 
 
@@ -76,6 +76,10 @@ def _parser() -> argparse.ArgumentParser:
         help="of clips shown to the same person again (0.04)",
     )  # fmt: skip
 
+    serve.add_argument(
+        "--compare", action="store_true", help="annotators may also say which of two clips is nearer"
+    )
+
     train = _command(commands, "train", _train, "the same trainer without a browser, rated by a program")
     _run_options(train)
     train.add_argument(
@@ -125,6 +129,10 @@ def _parser() -> argparse.ArgumentParser:
     preferences.add_argument(
         "--comparisons", type=int, default=350, metavar="N", help="in all, 4 of 7 before practice (350)"
     )
+    preferences.add_argument(
+        "--from-run", metavar="NAME", help="learn from what people compared in this run, and ask nobody"
+    )
+    add_data_dir(preferences)
     preferences.add_argument("--steps", type=int, default=3_000_000, help="control steps (3 million)")
     preferences.add_argument("--seed", type=int, default=0)
     for command in (trpo, preferences):
@@ -211,6 +219,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         run=arguments.run_name,
         new_run=arguments.new_run,
         again=again,
+        compare=arguments.compare,
     )
 
 
@@ -312,12 +321,17 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
         PreferencesConfig,
         save_preferences,
         split_comparisons,
+        stored_comparisons,
         train_preferences,
     )
 
     pretrain, online = split_comparisons(arguments.comparisons)
     config = PreferencesConfig(pretrain=pretrain, online=online, steps=arguments.steps, seed=arguments.seed)
-    result = train_preferences(config)
+    given = []
+    if arguments.from_run is not None:
+        with open_store(arguments, must_exist=True) as store:
+            given = stored_comparisons(store, arguments.from_run)
+    result = train_preferences(config, given=given)
     save_preferences(arguments.out, result)
     for key, value in asdict(result.curve[-1]).items():
         print(f"{key:18} {value:g}")

@@ -37,6 +37,7 @@ def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentPar
     export.add_argument("--run", dest="run_name", metavar="NAME", help="only this run")
     export.add_argument("--rater", metavar="NAME", help="only this rater (of the CSV)")
     export.add_argument("--segments", type=Path, metavar="FILE", help="states and actions behind the clips")
+    export.add_argument("--comparisons", type=Path, metavar="FILE", help="answers about pairs, as CSV")
     export.add_argument("--card", type=Path, metavar="FILE", help="the data card, in Markdown")
 
     back = command(commands, "import", _import, "an export back into an empty data directory")
@@ -65,19 +66,19 @@ def _rater_add(arguments: argparse.Namespace) -> None:
     name = arguments.name
     if not 1 <= len(name.strip()) <= 64 or not name.isprintable():
         raise UserError(f"a rater's name is 1 to 64 printable characters, got {name[:80]!r}")
-    with _open_store(arguments) as store:
+    with open_store(arguments) as store:
         rater = store.ensure_rater(name.strip(), "researcher" if arguments.researcher else "annotator")
         print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
 
 
 def _rater_list(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments, must_exist=True) as store:
+    with open_store(arguments, must_exist=True) as store:
         for rater in store.raters():
             print(f"{rater.name:24} {rater.role}")
 
 
 def _rater_revoke(arguments: argparse.Namespace) -> None:
-    with _open_store(arguments, must_exist=True) as store:
+    with open_store(arguments, must_exist=True) as store:
         raters = {rater.name: rater for rater in store.raters()}
         if arguments.name not in raters:
             raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
@@ -89,22 +90,26 @@ def _export(arguments: argparse.Namespace) -> None:
     from app.card import card
     from app.exports import csv_blocks, write_parquet
     from trainer.files import write_atomic
+    from trainer.pairs import COMPARISON_COLUMNS
 
-    with _open_store(arguments, must_exist=True) as store:
+    with open_store(arguments, must_exist=True) as store:
         run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
-        for file in (arguments.out, arguments.segments, arguments.card):
+        others = (arguments.segments, arguments.comparisons, arguments.card)
+        for file in (arguments.out, *others):
             if file is not None:
                 check_output(file, arguments.data_dir)
         if arguments.segments is not None:
             write_parquet(store, run, arguments.segments)
         if arguments.card is not None:
             write_atomic(arguments.card, card(store, run).encode())
+        if arguments.comparisons is not None:
+            write_atomic(arguments.comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
         blocks = csv_blocks(store.iter_ratings(run, rater=arguments.rater))
         if arguments.out is not None:
             write_atomic(arguments.out, blocks)
-        elif arguments.segments is None and arguments.card is None:
+        elif not any(others):
             for block in blocks:
                 sys.stdout.buffer.write(block)
             sys.stdout.buffer.flush()
@@ -117,7 +122,12 @@ def _import(arguments: argparse.Namespace) -> None:
     print("  ".join(f"{count} {what}" for what, count in there.items()))
 
 
-def _open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
+def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
+    """The database in ``--data-dir``, closed with the block.
+
+    Raises:
+        UserError: If there must be one and is none, or it cannot be opened.
+    """
     from contextlib import closing
 
     from trainer.store import FILE_NAME, Store

@@ -44,6 +44,23 @@ SEGMENTS: dict[str, str] = {
 """Of the Parquet file, in order; the last four are lists of rows."""
 
 
+COMPARISONS: dict[str, str] = {
+    "id": "Number of the answer; ascending in time.",
+    "pair_id": "Pair of clips.",
+    "run": "Training that the pair belongs to.",
+    "demo": "Name of the demonstration video.",
+    "rater": "Name of the rater.",
+    "answer": "Which clip is nearer to the video: left, right, or equal.",
+    "stage": "pretrain: random motion; online: the policy in training.",
+    "iteration": "Iteration of the policy whose motion the clips show; 0 in pretrain.",
+    "created_at": "When the answer was given: UTC, ISO 8601, milliseconds.",
+    "latency_ms": "From the pair on screen to the press, milliseconds.",
+    "demo_step": "Control step of the demonstration at which the clips begin.",
+    "steps": "Length of each clip, control steps.",
+}
+"""Of the CSV of comparisons, in order."""
+
+
 def as_table(columns: dict[str, str]) -> str:
     """Columns as a Markdown table."""
     rows = "\n".join(f"| `{name}` | {meaning} |" for name, meaning in columns.items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from itertools import islice
@@ -16,6 +16,7 @@ from aiohttp import web
 from app import exports
 from app.card import card
 from app.columns import RATINGS
+from trainer.pairs import COMPARISON_COLUMNS
 from trainer.store import Store
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -42,14 +43,23 @@ class Downloads:
         """Where they are. ``guard`` wraps each."""
         handlers = {
             "/export.csv": self._csv, "/segments.parquet": self._parquet, "/card.md": self._card,
-            "/preview": self._preview,
+            "/preview": self._preview, "/comparisons.csv": self._comparisons,
         }  # fmt: skip
         return [web.get(path, guard(handler)) for path, handler in handlers.items()]
 
     async def _csv(self, request: web.Request) -> web.StreamResponse:
-        response = self._attachment("ratings", "csv", "text/csv")
+        rows = self._store.iter_ratings(**read_filters(request.query))
+        return await self._stream(request, "ratings", exports.csv_blocks(rows))
+
+    async def _comparisons(self, request: web.Request) -> web.StreamResponse:
+        rows = self._store.iter_comparisons(read_filters(request.query).get("run"))
+        return await self._stream(request, "comparisons", exports.csv_blocks(rows, COMPARISON_COLUMNS))
+
+    async def _stream(
+        self, request: web.Request, what: str, blocks: Generator[bytes, None, None]
+    ) -> web.StreamResponse:
+        response = self._attachment(what, "csv", "text/csv")
         await response.prepare(request)
-        blocks = exports.csv_blocks(self._store.iter_ratings(**read_filters(request.query)))
         loop = asyncio.get_running_loop()
         # One thread for the whole export: a SQLite connection belongs to the thread that opened it.
         with ThreadPoolExecutor(max_workers=1) as reader:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
@@ -23,16 +23,19 @@ def defuse(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
-def csv_blocks(rows: Iterable[tuple], *, rows_per_block: int = 500) -> Iterator[bytes]:
+def csv_blocks(
+    rows: Iterable[tuple], columns: Sequence[str] = RATING_COLUMNS, *, rows_per_block: int = 500
+) -> Generator[bytes, None, None]:
     """The rows as UTF-8 CSV with one header, in blocks.
 
     Args:
-        rows: In the order of ``trainer.store.RATING_COLUMNS``.
+        rows: In the order of the columns.
+        columns: Their names.
         rows_per_block: How many rows to put in a block.
     """
     buffer = io.StringIO()
     writer = csv.writer(buffer)
-    writer.writerow(RATING_COLUMNS)
+    writer.writerow(columns)
     rows = iter(rows)
     while block := list(islice(rows, rows_per_block)):
         writer.writerows([[defuse(cell) for cell in row] for row in block])

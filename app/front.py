@@ -73,6 +73,10 @@ class Trained(Protocol):
         """The picture of a clip."""
         ...
 
+    def pair_file(self, pair_id: int) -> Path:
+        """The picture of a pair."""
+        ...
+
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         """The best rollout of an iteration."""
         ...
@@ -204,6 +208,7 @@ class Front:
                 web.get("/healthz", self._health),
                 web.get("/static/{name}", self._static),
                 web.get(r"/clips/{clip:\d{1,15}}.jpg", self._clip),
+                web.get(r"/pairs/{pair:\d{1,15}}.jpg", self._pair),
                 web.get(r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", _for_researchers(self._rollout)),
                 web.get(r"/demo/frames/{index:\d{1,6}}.jpg", self._demo_frame),
                 web.get(r"/demo/examples/{name:[a-z]{1,20}}.jpg", self._demo_example),
@@ -336,6 +341,14 @@ class Front:
             raise web.HTTPNotFound()
         path = self._page.trainer.clip_file(number)
         if not path.is_file():
+            raise web.HTTPNotFound()
+        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
+
+    async def _pair(self, request: web.Request) -> web.StreamResponse:
+        number = int(request.match_info["pair"])
+        run = await asyncio.to_thread(self._store.pair_run, number)
+        path = self._page.trainer.pair_file(number)
+        if run != self._page.trainer.run or not path.is_file():
             raise web.HTTPNotFound()
         return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
 

@@ -76,7 +76,7 @@ def waiting_html(status: Status, count: int, problem: str) -> str:
     return f'<div class="od-waiting" role="status">{body}{_trouble(problem)}</div>'
 
 
-def tools_html(*, rating: bool, can_undo: bool, practising: bool = False) -> str:
+def tools_html(*, rating: bool, can_undo: bool, practising: bool = False, marking: bool = True) -> str:
     """Undo, skip, replay, slow motion, single frames, keys."""
     undo = "" if practising else _tool("Undo", "U", 'data-key="u"' + ("" if can_undo else " disabled"))
     if not rating:
@@ -88,7 +88,7 @@ def tools_html(*, rating: bool, can_undo: bool, practising: bool = False) -> str
         _tool("Slow", "F", 'data-slow aria-pressed="false"'),
         _tool("Step back", "←", 'data-step="-1"'),
         _tool("Step on", "→", 'data-step="1"'),
-        "" if practising else _tool("Mark", "M", "data-mark"),
+        _tool("Mark", "M", "data-mark") if marking and not practising else "",
         _tool("Keys", "?", "data-help"),
     )
     return f'<div class="od-tools" role="group" aria-label="Tools">{"".join(buttons)}</div>'

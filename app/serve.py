@@ -35,6 +35,7 @@ def serve(
     run: str | None,
     new_run: bool,
     again: Again,
+    compare: bool = False,
 ) -> None:
     """Serves one run until the process is told to end (Ctrl-C or SIGTERM).
 
@@ -51,6 +52,7 @@ def serve(
         run: Name of the run to go on with or to make; None: the newest of this demo.
         new_run: Start over even if there is a run of this demo.
         again: How many clips are asked again.
+        compare: Whether annotators are asked pairs, too.
 
     Raises:
         UserError: If the data directory, the port or the graphics library cannot be used.
@@ -69,7 +71,7 @@ def serve(
         run = add_run(store, data_dir, demo, config, name=run)
     study = Study(store, data_dir, renderer, encoder_weights=encoder_weights, device=config.device)
     study.serve(run, demo, config)
-    page = Page(study.trainer, again=again, study=study)
+    page = Page(study.trainer, again=again, study=study, compare=compare)
     study.served = page.serve
     front = Front(page, host=host, port=port)
     ended = threading.Event()

@@ -21,6 +21,7 @@ from viser import _messages
 
 from app import data, guide, rate, runs, watch
 from app.assignment import Again, Ask, Assignment
+from app.compare import Compare
 from app.desk import Desk, Mark
 from app.front import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from app.live import Live
@@ -50,13 +51,14 @@ class Page:
         pictures: Of its demo; made from the demo's video if not given.
         again: How many clips are asked again; the usual shares if not given.
         study: All runs; None if there is this one alone.
+        compare: Whether annotators are asked pairs, too.
     """
 
     def __init__(
         self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None,
-        study: Study | None = None,
+        study: Study | None = None, compare: bool = False,
     ) -> None:  # fmt: skip
-        self.study = study
+        self.study, self.compare = study, compare
         self.secret = secrets.token_urlsafe(32)
         self._again = again or Again()
         self._attach(trainer, pictures)
@@ -86,6 +88,7 @@ class Page:
         self.trainer = trainer
         self.pictures = pictures or Pictures(trainer.demo)
         self.assignment = Assignment(again=self._again)
+        self.pair_assignment = Assignment()
         self.live = Live(trainer.acting, trainer.demo.seconds)
         self.desks: dict[int, Desk] = {}
         """Where people rate, by client."""
@@ -137,7 +140,8 @@ class Page:
         try:
             session = Session(
                 self, client, rater, dark=headers.get(SCHEME_HEADER) == "dark",
-                done=self._done.setdefault(headers[SESSION_HEADER], []), makers=tabs_of(rater.role),
+                done=self._done.setdefault(headers[SESSION_HEADER], []),
+                makers=tabs_of(rater.role, compare=self.compare),
             )  # fmt: skip
         except Exception:
             log.exception("the page of %s could not be built", rater.name)
@@ -173,11 +177,11 @@ class Page:
                     log.exception("a page could not be refreshed")
 
 
-def tabs_of(role: str) -> list[TabMaker]:
+def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
     """The tabs a role gets, in order; the first one is shown first."""
     if role == "researcher":
-        return [watch.Watch, runs.Runs, rate.Rate, data.Data, guide.Guide]
-    return [rate.Rate, guide.Guide]
+        return [watch.Watch, runs.Runs, rate.Rate, Compare, data.Data, guide.Guide]
+    return [rate.Rate, *([Compare] if compare else []), guide.Guide]
 
 
 # Viser's private names, all of them; tests/test_server.py holds them.

@@ -1,9 +1,9 @@
 // Plays clips. One picture holds all frames of both sides (trainer/clips.py); they are drawn onto
 // canvases here, so that a clip can be slowed down, stepped through and marked. Whatever element has
 // data-src is a player; elements come and go as the server redraws the page.
-const WIDTH = 972;
 const HEIGHT = 360;
-const LEFT = { both: 0, left: 0, right: 492 };
+const LEFT = { both: 0, left: 0, right: 492, third: 984 };
+const WIDTH = { false: 972, true: 1464 }; // of a moment: video and one robot, or two
 const HOLD_S = 0.5; // the last frame stays so long before the clip starts over
 const SLOW = 0.25;
 const KEPT = 8; // pictures kept in memory
@@ -43,6 +43,7 @@ class Player {
     this.clip = Number(element.dataset.clip) || null;
     this.canvases = [...element.querySelectorAll("canvas")];
     this.box = element.parentElement;
+    this.width = WIDTH["pair" in element.dataset];
     this.time = 0;
     this.playing = !still.matches;
     this.once = false;
@@ -61,7 +62,7 @@ class Player {
     return this.entry.ready;
   }
   get columns() {
-    return Math.round(this.entry.image.naturalWidth / WIDTH);
+    return Math.round(this.entry.image.naturalWidth / this.width);
   }
   get frames() {
     return this.ready ? this.columns * Math.round(this.entry.image.naturalHeight / HEIGHT) : 1;
@@ -77,7 +78,7 @@ class Player {
     if (frame === this.drawn) return;
     this.drawn = frame;
     const y = Math.floor(frame / this.columns) * HEIGHT;
-    const x = (frame % this.columns) * WIDTH;
+    const x = (frame % this.columns) * this.width;
     for (const canvas of this.canvases) {
       const { width, height } = canvas;
       canvas

@@ -76,11 +76,8 @@ class StandIn:
     def add_clips(self, count: int) -> list[int]:
         from trainer.clips import compose_clip
 
-        zeros = Segment(
-            obs=np.zeros((38, 11)), actions=np.zeros((38, 3)), qpos=np.zeros((38, 6)), qvel=np.zeros((38, 6))
-        )
         new = [
-            NewClip(demo_step=38 * i % 900, segment=zeros, stage="pretrain", iteration=0)
+            NewClip(demo_step=38 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
             for i in range(count)
         ]
         ids = [clip.id for clip in self.store.add_clips(self.run, new)]
@@ -103,6 +100,24 @@ class StandIn:
 
     def clip_file(self, clip_id: int) -> Path:
         return self.directory / f"{clip_id:06d}.jpg"
+
+    def want_pairs(self) -> None:
+        self.calls.append("pairs")
+
+    def pair_file(self, pair_id: int) -> Path:
+        return self.directory / f"pair-{pair_id}.jpg"
+
+    def add_pairs(self, count: int) -> list[int]:
+        from trainer.clips import compose_clip
+        from trainer.pairs import NewPair
+
+        pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)
+        ids = [pair.id for pair in self.store.add_pairs(self.run, [pair] * count)]
+        for number in ids:
+            robots = [drawn_frames(10, phase=number + k) for k in range(2)]
+            self.pair_file(number).write_bytes(compose_clip(self.frames[:10], *robots))
+        self.store.set_pair_state(ids, "ready")
+        return ids
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         from trainer.video import write_webm
@@ -132,3 +147,8 @@ class StandIn:
     def stop(self) -> None:
         self.calls.append("stop")
         self.set_status(phase="stopped")
+
+
+def _zeros() -> Segment:
+    sizes = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
+    return Segment(**{name: np.zeros((38, size)) for name, size in sizes.items()})

@@ -35,10 +35,18 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
         page.keyboard.press("1")
         page.wait_for_selector(".od-feedback")
         assert_nothing_serious(page, "feedback")
+    site.trainer.add_pairs(2)
+    store.rate(site.trainer.add_clips(1)[0], new.id, 3, 900)
+    store.add_iteration(
+        site.trainer.run, 1, snapshot=1, env_steps=16_000,
+        stats={"predicted": 2.0, "kl": 0.01, "best": 2.5, "timeline": [None] * 20 + [2.0] * 20},
+    )  # fmt: skip
     with opened(chromium, site.links["researcher"], viewport, color_scheme=scheme) as page:
         for tab, content in (
-            ("Watch", ".od-strip"),
-            ("Data", ".od-data"),
+            ("Watch", ".od-gallery img"),
+            ("Runs", ".od-runs"),
+            ("Compare", ".od-pair [data-frame]"),
+            ("Data", ".od-quality"),
             ("Guide", ".od-example [data-frame]"),
             ("Rate", ".od-clip [data-frame]"),
         ):

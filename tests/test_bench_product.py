@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 from dataclasses import replace
 
+import aside
 import pytest
 
 from trainer.bench import product
@@ -23,7 +23,7 @@ def data_dir(tmp_path_factory):
 
 def test_presses_are_timed_and_counted(data_dir):
     # Raises if a press is lost or doubled.
-    figures = asyncio.run(product.press_times(data_dir, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}))
+    figures = aside.run(product.press_times(data_dir, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}))
     assert [figure.name for figure in figures] == ["press_1_annotator", "press_4_annotators"]
     for figure in figures:
         assert math.isfinite(figure.value) and figure.reach == 2 and not figure.at_least
@@ -40,7 +40,7 @@ def test_lost_doubled_and_changed_ratings_are_noticed(data_dir):
 
     with product.serving(data_dir) as server:
         ((before,),) = server.rows("SELECT IFNULL(MAX(id), 0) FROM events")
-        presses = asyncio.run(rate_three(server))
+        presses = aside.run(rate_three(server))
         check_counts(server, presses, after=before)
         changed = replace(presses[0], value=presses[0].value % 5 + 1)
         for wrong in (presses[1:], [*presses, presses[0]], [changed, *presses[1:]]):
@@ -50,7 +50,7 @@ def test_lost_doubled_and_changed_ratings_are_noticed(data_dir):
 
 
 def test_start_is_timed_until_the_page_shows_something(data_dir):
-    assert 0 < asyncio.run(product.start_time(data_dir, 1)).value < 60
+    assert 0 < aside.run(product.start_time(data_dir, 1)).value < 60
 
 
 def test_server_that_cannot_start_says_why(data_dir):

@@ -45,6 +45,12 @@ def rows(data_dir, columns="clip_id, value"):
         return db.execute(f"SELECT {columns} FROM ratings ORDER BY id").fetchall()
 
 
+def skip_practice(page):
+    """Somebody new begins with practice clips."""
+    page.wait_for_selector(".od-practice [data-frame]", timeout=90_000)
+    page.keyboard.press("s")
+
+
 def health(link):
     with urllib.request.urlopen(link.split("/login")[0] + "/healthz", timeout=10) as answer:
         return json.load(answer)
@@ -61,7 +67,9 @@ def rate(page, data_dir, value, how="key"):
         drag_slider(page, value)
         page.click("[data-submit]")
     until(lambda: len(rows(data_dir)) > before)
-    page.wait_for_function("clip => document.querySelector('.od-clip')?.dataset.clip !== clip", arg=str(clip))
+    page.wait_for_function(
+        "clip => document.querySelector('.od-clip .od-player')?.dataset.clip !== clip", arg=str(clip)
+    )
     return clip, value
 
 
@@ -71,6 +79,7 @@ def rate_five_and_look(chromium, serving, tmp_path, *options):
     assert links, log.read_text()
     ways = [(1, "key"), (2, "button"), (5, "slider"), (3, "key"), (4, "button")]
     with opened(chromium, links["annotator"]) as page:
+        skip_practice(page)
         expected = [rate(page, data_dir, value, how) for value, how in ways]
     assert rows(data_dir) == expected
     until(lambda: health(links["annotator"])["phase"] == "online", 60)
@@ -110,6 +119,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     data_dir = serving.data_dir
     child, links, _ = serving.start(*QUICK)
     with opened(chromium, links["annotator"]) as page:
+        skip_practice(page)
         given = [rate(page, data_dir, value) for value in (1, 2, 3, 1, 2)]
         until(lambda: iterations(data_dir) >= 2, 90)
         given += [rate(page, data_dir, value) for value in (4, 2)]

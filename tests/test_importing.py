@@ -2,6 +2,7 @@
 
 import csv
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,7 +11,7 @@ from worlds import Thumbnail, falling_demo, small_config
 
 from app.card import card
 from app.cli import main
-from app.columns import RATINGS, SEGMENTS
+from app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
 from trainer.asking import Simulated
 from trainer.config import load_config
 from trainer.learner import Learner
@@ -163,3 +164,9 @@ def test_an_export_of_one_rater(study, capfdbinary):
         ("5", "0", "1"),
         ("4", "1", "1"),
     ]
+
+
+def test_the_documentation_has_the_columns():
+    text = (Path(__file__).parents[1] / "docs" / "data.md").read_text()
+    for columns in (RATINGS, SEGMENTS, COMPARISONS):
+        assert as_table(columns) in text

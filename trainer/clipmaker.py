@@ -28,7 +28,6 @@ class ClipMaker:
         store: Holds the segments; is told when a picture is there.
         file: Where the picture of a clip goes, by its number.
         frames: The demo's frames, (F, H, W, 3), uint8.
-        fps: Frames per second of the demo.
         frames_of: Demo frame at given control steps.
         renderer: The thread that owns the GL context; not closed here.
     """
@@ -39,13 +38,12 @@ class ClipMaker:
         *,
         file: Callable[[int], Path],
         frames: np.ndarray,
-        fps: float,
         frames_of: Callable[[np.ndarray], np.ndarray],
         renderer: RenderThread,
     ) -> None:
         self._store = store
         self._file = file
-        self._frames, self._fps, self._frames_of = frames, fps, frames_of
+        self._frames, self._frames_of = frames, frames_of
         self._renderer = renderer
         self._failed: list[Clip] = []
         self._failed_at = 0.0

@@ -32,6 +32,7 @@ from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
+from trainer.pairing import Pairing
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
 from trainer.priority import give_way
@@ -96,6 +97,7 @@ class Trainer:
         self._learner: Learner | None = None
         self._snapshot: Snapshot | None = None
         self._fitted_event = 0
+        self._pairing: Pairing | None = None
         self._gallery = None
         if renderer is not None:
             self._gallery = gallery.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
@@ -165,6 +167,15 @@ class Trainer:
         """The picture of a clip, all its frames; it is there once the clip is "ready"."""
         return self.directory / "clips" / f"{clip_id:06d}.jpg"
 
+    def want_pairs(self) -> None:
+        """Somebody would compare pairs: some are made while this is said every few seconds."""
+        if self._pairing is not None:
+            self._pairing.want()
+
+    def pair_file(self, pair_id: int) -> Path:
+        """The picture of a pair; it is there once the pair is "ready"."""
+        return self.directory / "pairs" / f"{pair_id:06d}.jpg"
+
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         """The best rollout of an iteration, as ``Gallery.file``.
 
@@ -215,7 +226,7 @@ class Trainer:
         learner = self._prepare()
         limit = self.config.rollouts.total_steps
         while not self._stop.is_set():
-            self._asking.fill(learner, self._pool, self._snapshot)
+            self._ask(learner)
             if learner.env_steps >= limit:
                 self._tell("done", "The robot has practised as long as it was told to.")
                 if self._simulated is not None:
@@ -251,25 +262,30 @@ class Trainer:
         self._learner = learner
         self._load_snapshot()
         if self._renderer is not None:
+            frames = read_frames(self.demo)
             self._asking.clips = ClipMaker(
-                self.store,
-                file=self.clip_file,
-                frames=read_frames(self.demo),
-                fps=self.demo.fps,
-                frames_of=learner.frames_of,
+                self.store, file=self.clip_file, frames=frames, frames_of=learner.frames_of,
                 renderer=self._renderer,
+            )  # fmt: skip
+            self._pairing = Pairing(
+                self.store, self.run, self.directory / "pairs", frames, self._renderer, self.config.seed
             )
             self._asking.clips.recover(self.run)
         with ThreadPoolExecutor(1, "look") as beside:
             looking = beside.submit(self._look)
             while not looking.done():
                 if self._simulated is None:
-                    self._asking.fill(learner, self._pool, self._snapshot)  # people rate meanwhile
+                    self._ask(learner)  # people rate meanwhile
                 wait([looking], _TICK_S)
         torch.set_num_threads(1)
         learner.look_at(*looking.result())
         self._policy = learner.policy()
         return learner
+
+    def _ask(self, learner: Learner) -> None:
+        self._asking.fill(learner, self._pool, self._snapshot)
+        if self._pairing is not None:
+            self._pairing.fill(learner, self._pool)
 
     def _look(self) -> tuple[np.ndarray, Track | None]:
         """Looks at the demo, and at the robot if asked for: a minute or more the first time.
@@ -352,7 +368,7 @@ class Trainer:
         while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
             try:
                 if self._learner is not None:
-                    self._asking.fill(self._learner, self._pool, self._snapshot)
+                    self._ask(self._learner)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
         self._status = replace(self._status, error="")

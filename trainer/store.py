@@ -1,4 +1,4 @@
-"""All there is in the database, in one object: people, answers, runs and clips, what the trainer did."""
+"""All there is in the database, in one object: people, answers, pairs, runs and clips, what was trained."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from trainer.answers import RATING_COLUMNS, Answers, RatedSegment, Rating
 from trainer.database import FILE_NAME, now
 from trainer.errors import UserError
+from trainer.pairs import Pairs
 from trainer.people import People
 from trainer.records import Clip, Segment
 from trainer.segments import pack_segment, unpack_segment
@@ -33,7 +34,7 @@ class NewClip:
     score: float | None = None
 
 
-class Store(People, Answers):
+class Store(People, Answers, Pairs):
     """The database in ``data_dir``. Arguments and errors as ``trainer.database.Database``."""
 
     # Runs

@@ -45,7 +45,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "class weights": _ONE_LAYER_LESS | {"predictor.sampling": "random", "predictor.class_weights": True},
     "equal + weights": _ONE_LAYER_LESS | {"predictor.class_weights": True},
     "additional layer": _NETWORK,
-    "all frame features": _NETWORK | {"predictor.visual_dims": 0},
+    "principal components": _NETWORK | {"predictor.visual_dims": 24},
     "ordinal loss": _NETWORK | {"predictor.ordinal": True},
     "ordinal, 3 networks": _NETWORK | {"predictor.ordinal": True, "predictor.members": 3},
     "metric": {"method": "onedemo"},

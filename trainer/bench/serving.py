@@ -38,6 +38,7 @@ class Server:
         self._log = data_dir.with_name(f"{data_dir.name}.err").open("w+")
         # By name: what is measured stands above this package, which imports nothing of it.
         command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
+        command += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
         command += [word for setting in settings for word in ("--set", setting)]
         command += ["--new-run"] if settings else []
         self._child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, text=True)
@@ -49,6 +50,9 @@ class Server:
             said = Path(self._log.name).read_text().strip()
             self.close()
             raise RuntimeError(f"onedemo serve did not start: {said}")
+        with closing(Store(data_dir)) as store:  # nobody practises here
+            for rater in store.raters():
+                store.set_practised(rater.id)
 
     @property
     def base(self) -> str:
@@ -145,6 +149,7 @@ def annotator_link(server: Server, store: Store, name: str) -> str:
     """A link for an annotator of that name, as good as one that ``onedemo rater add`` prints."""
     token = secrets.token_urlsafe(32)
     rater = store.ensure_rater(name, "annotator")
+    store.set_practised(rater.id)
     store.add_token(hashlib.sha256(token.encode()).hexdigest(), rater.id, "link")
     return f"{server.base}/login?token={token}"
 

@@ -46,7 +46,7 @@ KINDS = {
     "method": Kind("trainer.bench.method:run"),
     "transfer": Kind("trainer.bench.transfer:run"),
     "person": Kind("trainer.bench.person:run"),
-    "predictor": Kind("trainer.bench.predictor_trial:run"),
+    "predictor": Kind("trainer.bench.predictor_trial:run", version=2),
     "handcoded": Kind("trainer.bench.controls:handcoded"),
     "preferences": Kind("trainer.bench.controls:preferences"),
     "truth": Kind("trainer.bench.controls:truth"),
