@@ -202,9 +202,11 @@ def export_html(run: str, path: str) -> str:
         '<div class="od-downloads">'
         f'<a class="od-button od-primary" href="/export.csv{query}" data-filtered="/export.csv" download>'
         "Download CSV</a>"
-        f'<a class="od-button" href="/segments.parquet{query}" download>Segments (Parquet)</a>'
-        f'<a class="od-button" href="/comparisons.csv{query}" download>Comparisons (CSV)</a>'
-        f'<a class="od-button" href="/card.md{query}" download>Data card</a></div>'
+        f'<a class="od-button" href="/segments.parquet{query}" data-of-run="/segments.parquet" download>'
+        "Segments (Parquet)</a>"
+        f'<a class="od-button" href="/comparisons.csv{query}" data-of-run="/comparisons.csv" download>'
+        "Comparisons (CSV)</a>"
+        f'<a class="od-button" href="/card.md{query}" data-of-run="/card.md" download>Data card</a></div>'
         "<p class=od-quiet>The CSV has one header, times in UTC, formula-like cells made harmless. The "
         "segments are the states and actions behind the clips. <code>onedemo import</code> reads both "
         "back.</p></section>"

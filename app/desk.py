@@ -63,6 +63,7 @@ class Desk:
         self._lock = threading.RLock()
         self._done = done if done is not None else []
         self._shown_at = 0.0
+        self._kind = self._assignment.again.draw(self._rng)
         self._current: Ask | None = None
         self._upcoming: Ask | None = None
         self.mark: Mark | None = None
@@ -188,13 +189,20 @@ class Desk:
 
     def _accepted(self, clip: int) -> Ask | None:
         in_time = self._clock() - self._shown_at >= GUARD_SECONDS
-        return self._current if clip == self.current and in_time else None
+        ask = self._current if clip == self.current and in_time else None
+        if ask is not None and self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat):
+            # The same person has answered it at another page meanwhile.
+            self._assignment.release(self._holder, ask.clip)
+            self._advance()
+            return None
+        return ask
 
     def _latency_ms(self) -> int:
         return round(1000 * (self._clock() - self._shown_at))
 
     def _leave(self, ask: Ask) -> None:
         self._done.append(ask)
+        self._kind = self._assignment.again.draw(self._rng)
         self._assignment.release(self._holder, ask.clip)
         self._advance()
 
@@ -208,13 +216,27 @@ class Desk:
 
     def _still_asked(self, ask: Ask, waiting: list[int]) -> bool:
         """Whether a clip that was fetched ahead may still be shown: others may have taken it since."""
-        return (ask.kind != "fresh" or ask.clip in waiting) and self._take([ask.clip]) is not None
+        asked = (
+            ask.clip in waiting
+            if ask.kind == "fresh"
+            else not self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat)
+        )
+        return asked and self._take([ask.clip]) is not None
 
     def _pick(self, waiting: list[int]) -> Ask | None:
-        kind = self._assignment.again.draw(self._rng)
-        if kind != "fresh":
-            among = to_share if kind == "shared" else to_repeat
-            clip = self._take(among(self._store.answered(self._run), self.rater.id))
+        """The next clip; what kind it is was drawn by lot when the last one was answered.
+
+        Nothing is asked again while nothing fresh waits: people would go on beyond what was asked for.
+        """
+        if not waiting:
+            return None
+        if self._kind != "fresh":
+            kind, self._kind = self._kind, "fresh"
+            mine = self._store.answered(self._run, rater_id=self.rater.id)
+            if kind == "repeated":
+                clip = self._take(to_repeat(mine, self.rater.id))
+            else:
+                clip = self._take(to_share([*mine, *self._store.answered(self._run)], self.rater.id))
             if clip is not None:
                 return Ask(clip, kind)
         clip = self._take(waiting)

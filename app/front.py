@@ -427,6 +427,7 @@ class Front:
 
 
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
+"""Addresses of what differs between runs or demos end in ?v= and what they are of."""
 
 
 async def _forward(source, target) -> None:

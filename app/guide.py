@@ -6,7 +6,7 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Any
 
-from app.player import player_html
+from app.player import example_address, player_html
 from app.words import ANSWERS, MEANINGS, keys_html
 from trainer.records import Status
 
@@ -51,22 +51,23 @@ class Guide:
     def _load(self) -> None:
         try:
             self._pictures.examples()
-            self._html.content = guide_html(self._pictures.demo.fps)
+            self._html.content = guide_html(self._pictures.demo.fps, self._pictures.demo.sha256)
         except Exception:
             log.exception("the examples of the guide could not be made")
 
 
-def guide_html(fps: float | None) -> str:
+def guide_html(fps: float | None, sha256: str = "") -> str:
     """The whole tab.
 
     Args:
         fps: Frames per second of the examples; None while they are not made yet.
+        sha256: Of the demo.
     """
     scale = "".join(
         f"<li><b>{value}</b><div><strong>{answer}</strong><span>{meaning}</span></div></li>"
         for value, (answer, meaning) in enumerate(zip(ANSWERS, MEANINGS, strict=True), start=1)
     )
-    shown = _examples_html(fps) if fps is not None else _NO_EXAMPLES
+    shown = _examples_html(fps, sha256) if fps is not None else _NO_EXAMPLES
     return (
         '<article class="od-guide"><header><h1>How to rate</h1><p>A robot is learning a move from one video. '
         "You see two short movements, about a third of a second each, at real speed: a moment of the video, "
@@ -90,7 +91,7 @@ def guide_html(fps: float | None) -> str:
 _NO_EXAMPLES = '<p class="od-quiet" role="status">The examples are being made…</p>'
 
 
-def _examples_html(fps: float) -> str:
+def _examples_html(fps: float, sha256: str) -> str:
     captions = {
         "same": ("5", "Twice the same moment."),
         "near": ("4", "Moments that look nearly alike."),
@@ -100,7 +101,7 @@ def _examples_html(fps: float) -> str:
     cards = ""
     for name, (value, text) in captions.items():
         cards += (
-            f'<figure class="od-example">{player_html(f"/demo/examples/{name}.jpg", fps, "both")}'
+            f'<figure class="od-example">{player_html(example_address(name, sha256), fps, "both")}'
             f"<figcaption><b>{value}</b><span>{text}</span></figcaption></figure>"
         )
     return (

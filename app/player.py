@@ -5,6 +5,11 @@ from __future__ import annotations
 _CAPTIONS = {"left": "From the video", "right": "The robot"}
 
 
+def example_address(name: str, sha256: str) -> str:
+    """Where an example from a demo is; another demo's are elsewhere, as browsers keep them."""
+    return f"/demo/examples/{name}.jpg?v={sha256[:8]}"
+
+
 def player_html(
     source: str, fps: float, *sides: str, attributes: str = "", captions: dict[str, str] | None = None
 ) -> str:

@@ -59,7 +59,7 @@ class Rate:
             self._slider = gui.add_slider("Rating", 1, 5, 1, _MIDDLE, marks=marks)
             gui.add_html(html.SUBMIT)
         self._tools = gui.add_html("")
-        self._why = gui.add_html("")
+        self._why, self._ahead = gui.add_html(""), gui.add_html("")
         gui.add_html(html.KEYS_DIALOG)
         self._content: dict[int, str] = {}
 
@@ -141,19 +141,20 @@ class Rate:
         if clip is not None:
             self._put(
                 self._stage,
-                html.clip_html(clip, self.desk.upcoming, self._fps, self._problem),
+                html.clip_html(clip, self._fps, self._problem),
             )
         else:
             self._put(self._stage, html.waiting_html(self._status, count, self._problem))
         self._put(self._tools, html.tools_html(rating=asking, can_undo=self.desk.can_undo))
         self._put(self._why, html.why_html(self.desk.skipped))
+        self._put(self._ahead, html.ahead_html(self.desk.upcoming))
         self._show_answers(asking)
         self._set_keys(clip)
 
     def _draw_lesson(self) -> None:
         lesson = self._lesson
         self._put(self._top, html.lesson_top_html(lesson.index + 1, len(lesson.exercises)))
-        self._put(self._stage, html.lesson_html(lesson, self._fps, self._problem))
+        self._put(self._stage, html.lesson_html(lesson, self._pictures.demo, self._problem))
         self._put(self._tools, html.tools_html(rating=True, can_undo=False, practising=True))
         self._put(self._why, "")
         self._show_answers(lesson.answer is None)

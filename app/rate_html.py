@@ -5,9 +5,9 @@ from __future__ import annotations
 from html import escape
 
 from app.lesson import Lesson
-from app.player import player_html
+from app.player import example_address, player_html
 from app.words import ANSWERS, REASONS, keys_html
-from trainer.records import Status
+from trainer.records import Demo, Status
 
 SUBMIT = (
     '<div class="od-submit">'
@@ -34,11 +34,15 @@ def top_html(count: int, target: int, *, asking: bool) -> str:
     )
 
 
-def clip_html(clip: int, upcoming: int | None, fps: float, problem: str) -> str:
-    """The clip, its time bar, and the next one to be fetched ahead."""
-    ahead = f' data-ahead="/clips/{upcoming}.jpg"' if upcoming is not None else ""
-    player = player_html(f"/clips/{clip}.jpg", fps, "left", "right", attributes=f'data-clip="{clip}"{ahead}')
+def clip_html(clip: int, fps: float, problem: str) -> str:
+    """The clip and its time bar."""
+    player = player_html(f"/clips/{clip}.jpg", fps, "left", "right", attributes=f'data-clip="{clip}"')
     return f'<div class="od-clip">{player}{_BAR}</div>{_trouble(problem)}'
+
+
+def ahead_html(upcoming: int | None) -> str:
+    """The next clip, to be fetched ahead; apart, so that the clip on screen is not drawn anew for it."""
+    return f'<i class="od-ahead" data-ahead="/clips/{upcoming}.jpg"></i>' if upcoming is not None else ""
 
 
 _BAR = (
@@ -122,11 +126,11 @@ def lesson_top_html(number: int, of: int) -> str:
     )
 
 
-def lesson_html(lesson: Lesson, fps: float, problem: str) -> str:
+def lesson_html(lesson: Lesson, demo: Demo, problem: str) -> str:
     """A practice clip: both sides are moments of the video; once answered, what to say of it."""
-    source = f"/demo/examples/{lesson.exercise.example}.jpg"
+    source = example_address(lesson.exercise.example, demo.sha256)
     player = player_html(
-        source, fps, "left", "right", captions={"left": "From the video", "right": "Compare"}
+        source, demo.fps, "left", "right", captions={"left": "From the video", "right": "Compare"}
     )
     said = ""
     if lesson.answer is not None:

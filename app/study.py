@@ -15,6 +15,7 @@ from trainer.encoders import make_encoder
 from trainer.errors import UserError
 from trainer.files import hold
 from trainer.loop import Trainer
+from trainer.predictor import Snapshot, check_start
 from trainer.records import Demo
 from trainer.render import RenderThread
 from trainer.runs import add_run, find_run
@@ -113,6 +114,7 @@ class Study:
             start = None
             if predictor_from is not None:
                 start = newest_snapshot(self._store, self._data_dir, predictor_from)
+                check_start(Snapshot.load(start), config.predictor)
             found = find_demo(demo, self._data_dir / "demos")
             run = add_run(self._store, self._data_dir, found, config, name=name)
             self._switch(run, found, config, start=start)
@@ -124,7 +126,7 @@ class Study:
         self._held.close()
 
     def _switch(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
-        self.trainer.stop()
+        self.trainer.retire()
         try:
             self.serve(run, demo, config, start=start)
         except BaseException:

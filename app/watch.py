@@ -66,12 +66,12 @@ class Watch:
         self._picture = gui.add_html("")
         self._time = gui.add_html("")
         self._parts = gui.add_html(progress.timeline_html([], self._demo.seconds))
-        gui.add_html(_preload(self._demo.frames))
+        gui.add_html(_preload(self._demo.frames, self._demo.sha256))
         self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
         self._classes = gui.add_html("")
         self._gallery = gui.add_html("")
         gui.add_html(progress.PLAYER)
-        self._put(self._picture, frame_html(0))
+        self._put(self._picture, frame_html(0, self._demo.sha256))
         self._put(self._time, time_html(0, 0, self._demo.seconds, ""))
 
     def show(self) -> None:
@@ -105,7 +105,7 @@ class Watch:
             self._charts.extend(new)
             if new:
                 self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
-                self._put(self._gallery, progress.gallery_html(self._charts.rows))
+                self._put(self._gallery, progress.gallery_html(self._charts.rows, self._trainer.run))
             self._put(
                 self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
             )
@@ -171,7 +171,7 @@ class Watch:
             frame = min(int(moment.demo_seconds * self._demo.fps), self._demo.frames - 1)
             if frame // max(1, round(self._demo.fps / _DEMO_HZ)) != self._frame:
                 self._frame = frame // max(1, round(self._demo.fps / _DEMO_HZ))
-                self._put(self._picture, frame_html(frame))
+                self._put(self._picture, frame_html(frame, self._demo.sha256))
                 note = "" if moment.acting and self._practised else _UNPRACTISED
                 where = time_html(moment.demo_seconds, moment.seconds, self._demo.seconds, note)
                 self._put(self._time, where)
@@ -213,12 +213,17 @@ def strip_html(status: Status, confirming: bool) -> str:
     )
 
 
-def frame_html(frame: int) -> str:
+def frame_html(frame: int, sha256: str) -> str:
     """One frame of the demo; ``decoding=sync`` paints it without a gap."""
     return (
         '<figure class="od-view od-demonstration"><figcaption>Demonstration</figcaption>'
-        f'<div><img src="/demo/frames/{frame}.jpg" alt="" decoding="sync"></div></figure>'
+        f'<div><img src="{frame_address(frame, sha256)}" alt="" decoding="sync"></div></figure>'
     )
+
+
+def frame_address(frame: int, sha256: str) -> str:
+    """Where a frame of a demo is; another demo's are elsewhere, as browsers keep them."""
+    return f"/demo/frames/{frame}.jpg?v={sha256[:8]}"
 
 
 def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> str:
@@ -238,9 +243,9 @@ def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> 
     )
 
 
-def _preload(frames: int) -> str:
+def _preload(frames: int, sha256: str) -> str:
     # Once fetched they stay in the browser's memory as long as these elements are there.
-    images = "".join(f'<img src="/demo/frames/{n}.jpg" alt="">' for n in range(frames))
+    images = "".join(f'<img src="{frame_address(n, sha256)}" alt="">' for n in range(frames))
     return f'<div class="od-preload" aria-hidden="true">{images}</div>'
 
 

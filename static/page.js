@@ -88,6 +88,8 @@ window.addEventListener(
   "keydown",
   (event) => {
     if (typing(event.target) || event.ctrlKey || event.metaKey) return;
+    // A browser clicks a button anew with each repeat of a held Enter.
+    if (event.key === "Enter" && event.repeat) return event.preventDefault();
     const stop = () => {
       event.stopImmediatePropagation();
       event.preventDefault();
@@ -156,8 +158,8 @@ document.addEventListener("click", (event) => {
   } else if (data.do) {
     button.disabled = true; // until the page is drawn anew
     const { do: action, ...fields } = data;
-    const numbers = Object.entries(fields).map(([name, value]) => [name, /^\d+$/.test(value) ? Number(value) : value]);
-    post("do", { do: action, ...Object.fromEntries(numbers) }).catch((error) => {
+    if (fields.rater) fields.rater = Number(fields.rater);
+    post("do", { do: action, ...fields }).catch((error) => {
       button.disabled = false;
       button.textContent = error.message;
     });
@@ -237,6 +239,9 @@ document.addEventListener("input", (event) => {
   if (!form) return;
   for (const link of form.parentElement.querySelectorAll("[data-filtered]"))
     link.href = link.dataset.filtered + query(form);
+  const run = new URLSearchParams(query(form)).get("run");
+  for (const link of form.parentElement.querySelectorAll("[data-of-run]"))
+    link.href = link.dataset.ofRun + (run ? `?run=${encodeURIComponent(run)}` : "");
 });
 
 // Viser gives its slider no name.

@@ -51,7 +51,6 @@ class Player {
     this.marking = null; // frame at which a mark by key began
     this.drawn = -1;
     picture(this.source);
-    if (element.dataset.ahead) picture(element.dataset.ahead);
     this.draw();
   }
 
@@ -193,6 +192,7 @@ function look() {
     players.set(element, new Player(element));
     wake();
   }
+  for (const element of document.querySelectorAll("[data-ahead]")) picture(element.dataset.ahead);
   const slowButton = document.querySelector("[data-slow]");
   if (slowButton && slowButton.getAttribute("aria-pressed") !== String(slow))
     slowButton.setAttribute("aria-pressed", slow);

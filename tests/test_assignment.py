@@ -286,3 +286,49 @@ def test_shares_of_what_is_asked_again_are_as_set():
     kinds = [Again(shared=0.1, repeated=0.05).draw(rng) for _ in range(20_000)]
     assert kinds.count("shared") / kinds.count("fresh") == pytest.approx(0.1, abs=0.01)
     assert kinds.count("repeated") / kinds.count("fresh") == pytest.approx(0.05, abs=0.01)
+
+
+def test_while_nothing_fresh_waits_nothing_is_asked_again(store, clock):
+    assignment = Assignment()
+    add_clips(store, 1)
+    bo = make_desk(store, clock, "bo", assignment, rng=Always("fresh"))
+    bo.refill()
+    clock.now += 1
+    bo.rate(1, 4)
+    cy = make_desk(store, clock, "cy", assignment, rng=Always("shared"))
+    for _ in range(20):
+        assert not cy.refill() and cy.current is None
+    add_clips(store, 2)
+    cy.refill()
+    assert cy.current == 1
+
+
+def test_a_clip_that_was_rated_at_another_page_of_the_same_person_is_let_go(store, clock):
+    add_clips(store, 6)
+    assignment = Assignment(again=Again(shared=0, repeated=0))
+    first, second = (make_desk(store, clock, "bo", assignment) for _ in range(2))
+    second._holder = "phone"
+    first.refill()
+    clock.now += 121  # the lease has ended
+    second.refill()
+    assert second.current == first.current == 1
+    clock.now += 1
+    assert second.rate(1, 4)
+    assert not first.rate(1, 2) and first.current != 1
+    clock.now += 1
+    assert first.rate(first.current, 3)
+    assert [row[5] for row in store.iter_ratings()] == [4, 3]
+
+
+def test_repeats_come_however_many_others_rate(store, clock):
+    ids = add_clips(store, 60)
+    rater = store.ensure_rater("bo", "annotator").id
+    for clip in ids[:20]:
+        store.rate(clip, rater, 3, 900)
+    for number in range(20):
+        other = store.ensure_rater(f"other {number}", "annotator").id
+        for clip in ids[20:50]:
+            store.rate(clip, other, 3, 900)
+    desk = make_desk(store, clock, "bo", Assignment(), rng=Always("repeated"))
+    desk.refill()
+    assert desk.current == ids[0]

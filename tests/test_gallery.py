@@ -66,6 +66,6 @@ def test_the_gallery_shows_the_newest_and_some_of_all_before():
     shown = chosen(list(range(1, 626)))
     assert len(shown) == 12 and shown[0] == 625 and shown[-1] == 1 and shown == sorted(shown, reverse=True)
     rows = [{"number": k, "best": 2.0 + k / 10} for k in range(1, 4)]
-    html = gallery_html(rows)
+    html = gallery_html(rows, "r")
     assert html.index("Iteration 3") < html.index("Iteration 1") and "predicted rating 2.3" in html
-    assert gallery_html([{"number": 1}]) == ""
+    assert gallery_html([{"number": 1}], "r") == ""

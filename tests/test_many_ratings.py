@@ -7,6 +7,7 @@ import pytest
 
 from app.data import data_html
 from app.exports import csv_blocks
+from app.quality import quality, quality_by_rater, rating_rows
 from trainer.bench.data import _RUN, _ask_all, _begin, _fill, _press
 from trainer.store import RATING_COLUMNS, Store
 
@@ -73,7 +74,11 @@ def test_no_ratings_are_a_header():
 
 def test_the_data_tab_shows_the_tallies(store):
     _fill(store.path, 0, 500)
-    html = data_html(_RUN, "onedemo", store.tallies(_RUN), "/x/y.sqlite3")
+    rows = rating_rows(store, _RUN)
+    people = {rater.name: rater for rater in store.raters()}
+    html = data_html(
+        _RUN, "onedemo", store.tallies(_RUN), quality(rows), quality_by_rater(rows), people, set()
+    )
     assert "500 ratings" in html
     row = '<th scope="row">rater 3</th><td>pretrain</td>'
     cells = store.tallies(_RUN)["rater 3", "pretrain"]

@@ -67,7 +67,9 @@ def camera_message() -> bytes:
 
 def test_roles_get_their_tabs():
     assert [tab.title for tab in server.tabs_of("annotator")] == ["Rate", "Guide"]
-    assert [tab.title for tab in server.tabs_of("researcher")] == ["Watch", "Rate", "Data", "Guide"]
+    assert [tab.title for tab in server.tabs_of("annotator", compare=True)] == ["Rate", "Compare", "Guide"]
+    titles = [tab.title for tab in server.tabs_of("researcher")]
+    assert titles == ["Watch", "Runs", "Rate", "Compare", "Data", "Guide"]
 
 
 def test_only_known_messages_are_let_in():

@@ -170,17 +170,27 @@ class Answers(Database):
         )
         return {rater for rater, kind in dict(rows).items() if kind == "leave out"}
 
-    def answered(self, run: str, most: int = 400) -> list[Answered]:
+    def holds(self, clip_id: int, rater_id: int, *, repeat: bool = False) -> bool:
+        """Whether a rating or skip of a rater stands on a clip."""
+        rows = self.rows(
+            "SELECT kind FROM events WHERE clip_id = ? AND rater_id = ? AND repeat = ?"
+            " ORDER BY id DESC LIMIT 1",
+            (clip_id, rater_id, repeat),
+        )
+        return bool(rows) and rows[0][0] != "undo"
+
+    def answered(self, run: str, most: int = 400, *, rater_id: int | None = None) -> list[Answered]:
         """The last word of each rater on each of the clips of a run that were answered last, newest first.
 
         Args:
             run: Of which.
             most: Events to look back.
+            rater_id: Of this rater alone: then so many events of this one.
         """
         rows = self.rows(
             "SELECT e.clip_id, e.rater_id, e.kind, e.repeat FROM events e JOIN clips c ON c.id = e.clip_id"
-            " WHERE c.run = ? ORDER BY e.id DESC LIMIT ?",
-            (run, most),
+            " WHERE c.run = ?1 AND (?2 IS NULL OR e.rater_id = ?2) ORDER BY e.id DESC LIMIT ?3",
+            (run, rater_id, most),
         )
         last: dict[tuple, Answered] = {}
         for clip, rater, kind, repeat in rows:
@@ -218,6 +228,12 @@ class Answers(Database):
         where, values = ("", ()) if run is None else ("WHERE run = ?", (run,))
         counts = dict(self.rows(f"SELECT value, SUM(ratings) FROM tallies {where} GROUP BY value", values))
         return [counts.get(value, 0) for value in range(1, 6)]
+
+    def count_learned(self, run: str) -> int:
+        """How many ratings of a run hold, those of raters who were left out not counted."""
+        left_out = self.left_out(run)
+        rows = self.rows("SELECT rater_id, SUM(ratings) FROM tallies WHERE run = ? GROUP BY rater_id", (run,))
+        return sum(ratings for rater, ratings in rows if rater not in left_out)
 
     def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
         """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""

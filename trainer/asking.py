@@ -70,8 +70,8 @@ class Asking:
         return self._config.ratings.pretrain + self._config.ratings.online
 
     def given(self) -> int:
-        """Ratings that hold."""
-        return sum(self._store.ratings_by_class(self._run))
+        """Ratings that hold and are learned from."""
+        return self._store.count_learned(self._run)
 
     def fill(self, learner: Learner, pool: Transitions | None, snapshot: Snapshot | None) -> None:
         """Cuts clips; in place of those that a simulated rater declines it cuts others.

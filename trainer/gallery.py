@@ -8,6 +8,7 @@ Shapes: N lanes, T control steps, k frames, q = 6 positions.
 from __future__ import annotations
 
 import io
+import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +58,13 @@ def summarise(
     of_lanes = ratings.mean(axis=1)
     best = int(of_lanes.argmax())
     return means, best, float(of_lanes[best])
+
+
+def longest(ended: np.ndarray) -> slice:
+    """The longest stretch of steps within one episode, where some steps end one: (T,) bool."""
+    edges = [0, *(np.flatnonzero(ended) + 1).tolist(), len(ended)]
+    start, stop = max(itertools.pairwise(edges), key=lambda edge: edge[1] - edge[0])
+    return slice(start, stop)
 
 
 class Gallery:

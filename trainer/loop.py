@@ -107,6 +107,7 @@ class Trainer:
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
+        self._retired = False
         self._control = threading.Lock()
         self._thread: threading.Thread | None = None
         self._work_began = self._work_s = 0.0
@@ -124,6 +125,7 @@ class Trainer:
     def start(self) -> None:
         """Starts the thread; a run that was stopped goes on from its checkpoint."""
         self._stop.clear()
+        self._retired = False
         if self._status.phase == "stopped":
             self._tell("starting", "The run goes on from its last checkpoint.")
         self._thread = threading.Thread(target=self._run_thread, name="trainer", daemon=True)
@@ -136,11 +138,18 @@ class Trainer:
     def resume(self) -> None:
         """Goes on after ``pause`` or ``stop``, and tries again after a failure."""
         with self._control:  # two pages may press at once
+            if self._retired:
+                return
             self._pause.clear()
             self._retry.set()
             if self._stop.is_set() and self._thread is not None:
                 self._thread.join()
                 self.start()
+
+    def retire(self) -> None:
+        """Stops for good: ``resume`` does nothing from now on, until ``start``."""
+        self._retired = True
+        self.stop()
 
     def stop(self, timeout_s: float = 60.0) -> None:
         """Ends the run's thread after the iteration in hand; the checkpoint stays."""
@@ -316,8 +325,9 @@ class Trainer:
         stats |= self._true_reward(rollouts)
         if self._gallery is not None:
             parts, lane, best = gallery.summarise(snapshot, rollouts, learner.frames_of, learner.demo_steps)
+            whole = gallery.longest(rollouts.terminated[lane] | rollouts.truncated[lane])
             self._gallery.keep(
-                learner.iteration, rollouts.qpos[lane], learner.frames_of(rollouts.clock[lane])
+                learner.iteration, rollouts.qpos[lane, whole], learner.frames_of(rollouts.clock[lane, whole])
             )
             stats |= {"timeline": parts, "best": best}
         self._work_s = time.monotonic() - began

@@ -50,6 +50,7 @@ class Pairing:
         self._frames, self._renderer = frames, renderer
         self._rng = np.random.default_rng([seed, 1207])
         self._wanted_until = 0.0
+        self._begun = False
 
     def want(self) -> None:
         """Somebody looks; any thread may say so."""
@@ -63,7 +64,12 @@ class Pairing:
         """Cuts what is missing from the queue, if somebody looks, and has it drawn."""
         if pool is None or time.monotonic() > self._wanted_until:
             return
-        stale = [p.id for p in self._store.waiting_pairs(self._run) if p.iteration < learner.iteration - _OLD]
+        ready = self._store.waiting_pairs(self._run)
+        oldest = learner.iteration - _OLD
+        stale = [p.id for p in ready if p.iteration < oldest or not self.file(p.id).exists()]
+        if not self._begun:  # a process before this one was to draw them
+            stale += [p.id for p in self._store.waiting_pairs(self._run, "cut")]
+            self._begun = True
         self._store.set_pair_state(stale, "withdrawn")
         waiting = [p for state in ("ready", "cut") for p in self._store.waiting_pairs(self._run, state)]
         drawn = draw_pairs(

@@ -48,12 +48,13 @@ class TrainingSet:
         )
         return RatedSegment(
             event=rating.event, demo_step=rating.demo_step, segment=segment, value=rating.value,
-            mark=self._steps(rating),
+            mark=self._steps(rating, len(whole)),
         )  # fmt: skip
 
-    def _steps(self, rating: Rating) -> tuple[int, int] | None:
+    def _steps(self, rating: Rating, steps: int) -> tuple[int, int] | None:
         """The steps of a mark: those that a person saw in it."""
         if rating.mark_start is None or rating.mark_end is None:
             return None
         first, after = round(rating.mark_start / self._dt), round(rating.mark_end / self._dt)
+        first = min(first, steps - 1)  # the last picture shows what comes to the end of the clip
         return first, max(first + 1, after)

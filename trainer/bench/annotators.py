@@ -68,6 +68,7 @@ class Tab:
 
     def __post_init__(self) -> None:
         self._pictures: dict[int, asyncio.Task[None]] = {}
+        self._coming: int | None = None
         self._shown_at = 0.0
         self._changed = asyncio.Event()
         self._unpack = zstandard.ZstdDecompressor()
@@ -164,14 +165,20 @@ class Tab:
             if self.clip != int(found[1]):
                 self._shown_at = time.monotonic()
             self.clip, self.waiting = int(found[1]), False
-            ahead = _AHEAD.search(html)
-            wanted = [self.clip, *([int(ahead[1])] if ahead else [])]
-            # What was shown is forgotten, what comes is fetched ahead.
-            self._pictures = {
-                clip: self._pictures.get(clip) or asyncio.create_task(self._fetch(clip)) for clip in wanted
-            }
+            self._keep(self.clip, self._coming)
+        elif ahead := _AHEAD.search(html):
+            self._coming = int(ahead[1])
+            self._keep(self.clip, self._coming)
         elif _WAITING in html:
             self.clip, self.waiting = None, True
+
+    def _keep(self, *clips: int | None) -> None:
+        """What was shown is forgotten, what comes is fetched ahead."""
+        self._pictures = {
+            clip: self._pictures.get(clip) or asyncio.create_task(self._fetch(clip))
+            for clip in clips
+            if clip is not None
+        }
 
     async def _fetch(self, clip: int) -> None:
         async with self.session.get(f"{self.base}/clips/{clip}.jpg", headers=self.headers) as answer:
