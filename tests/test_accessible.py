@@ -12,6 +12,12 @@ OURS = {"include": [["[class^='od-']"]]}
 
 
 def assert_nothing_serious(page, where: str) -> None:
+    # Colours on their way from one scheme to the other have any contrast.
+    page.wait_for_timeout(300)
+    page.wait_for_function(
+        "() => document.getAnimations().every(a => a.playState !== 'running'"
+        " || a.effect.getComputedTiming().endTime === Infinity)"
+    )
     found = [
         (violation["id"], node["target"], node.get("failureSummary", "")[:200])
         for violation in Axe().run(page, context=OURS).response["violations"]
