@@ -67,6 +67,7 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
         page.wait_for_selector(".od-help[open]")
         assert_nothing_serious(page, "keys")
         page.keyboard.press("Escape")
+        page.wait_for_selector(".od-help", state="hidden")  # until then presses are not for the clip
         store.set_clip_state([c.id for c in store.waiting_clips(site.trainer.run)], "withdrawn")
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         page.wait_for_selector(".od-waiting, .od-clip")
