@@ -6,27 +6,23 @@ Rate tab; answers have a table of their own.
 
 from __future__ import annotations
 
-import logging
-import sqlite3
-import threading
 from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from app.pair_desk import PairDesk
 from app.player import player_html
+from app.pressing import Pressing
 from app.rate_html import KEYS_DIALOG, tools_html
 from trainer.records import Status
 
 if TYPE_CHECKING:
     from app.session import Session
 
-log = logging.getLogger("onedemo.page")
-
 _ANSWERS = (("1", "left", "The left one"), ("2", "equal", "Both alike"), ("3", "right", "The right one"))
 
 
-class Compare:
+class Compare(Pressing):
     """The Compare tab of one session."""
 
     title = "Compare"
@@ -34,16 +30,13 @@ class Compare:
     def __init__(self, session: Session) -> None:
         page, trainer = session.page, session.page.trainer
         self._trainer, self._store, self._run = trainer, trainer.store, trainer.run
-        self._client = session.client
-        self._lock = threading.RLock()
+        super().__init__(session.client)
         self._desk = PairDesk(
             trainer.store, trainer.run, session.rater, page.pair_assignment, session.client.client_id
         )
-        self._shown, self._problem = False, ""
         self._message = ""
         self._keys: list[Any] = []
         self._keys_for: Any = None
-        self._content: dict[int, str] = {}
         gui = session.client.gui
         self._top, self._stage = gui.add_html(""), gui.add_html("")
         self._answers, self._tools = gui.add_html(""), gui.add_html("")
@@ -74,23 +67,6 @@ class Compare:
         """Frees the pairs for others."""
         self._desk.close()
 
-    def _press(self, action: Any) -> None:
-        with self._lock:
-            if self._shown and (self._attempt(action) or self._problem):
-                self._draw()
-                self._client.flush()
-
-    def _attempt(self, action: Any, *, keep_problem: bool = False) -> bool:
-        try:
-            moved = action()
-        except (sqlite3.Error, ValueError) as error:
-            log.exception("an answer could not be saved")
-            self._problem = f"This could not be saved ({error}). Nothing is lost: please try again."
-            return False
-        if not keep_problem:
-            self._problem = ""
-        return moved
-
     def _draw(self) -> None:
         pair, count = self._desk.current, self._store.count_comparisons(self._run)
         with self._client.atomic():
@@ -104,11 +80,6 @@ class Compare:
             tools = tools_html(rating=pair is not None, can_undo=self._desk.can_undo, marking=False)
             self._put(self._tools, tools)
             self._set_keys(pair)
-
-    def _put(self, handle: Any, content: str) -> None:
-        if self._content.get(id(handle)) != content:
-            self._content[id(handle)] = content
-            handle.content = content
 
     def _set_keys(self, pair: int | None) -> None:
         wanted = (pair, self._desk.can_undo)

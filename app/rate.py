@@ -6,26 +6,22 @@ that was on screen, however slow the line is. The buttons press the same keys (`
 
 from __future__ import annotations
 
-import logging
-import sqlite3
-import threading
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from app import rate_html as html
 from app.desk import Desk
+from app.pressing import Pressing
 from app.words import ANSWERS
 from trainer.records import Status
 
 if TYPE_CHECKING:
     from app.session import Session
 
-log = logging.getLogger("onedemo.page")
-
 _MIDDLE = 3
 
 
-class Rate:
+class Rate(Pressing):
     """The Rate tab of one session."""
 
     title = "Rate"
@@ -35,16 +31,13 @@ class Rate:
         self._session = session
         self._store, self._run, self._fps = trainer.store, trainer.run, trainer.demo.fps
         self._pictures = page.pictures
-        self._client = session.client
-        self._lock = threading.RLock()
+        super().__init__(session.client)
         self.desk = Desk(
             trainer.store, trainer.run, session.rater, page.assignment, session.client.client_id,
             dt=trainer.dt, done=session.done,
         )  # fmt: skip
         page.desks[session.client.client_id] = self.desk
         self._status: Status = trainer.status()
-        self._problem = ""
-        self._shown = False
         self._clip_keys: list[Any] = []
         self._undo_keys: list[Any] = []
         self._keys_for: Any = None
@@ -61,7 +54,6 @@ class Rate:
         self._tools = gui.add_html("")
         self._why, self._ahead = gui.add_html(""), gui.add_html("")
         gui.add_html(html.KEYS_DIALOG)
-        self._content: dict[int, str] = {}
 
     def show(self) -> None:
         """Draws the tab and lets its keys act."""
@@ -96,26 +88,6 @@ class Rate:
         return None if lesson is None or lesson.over else lesson
 
     # Presses
-
-    def _press(self, action: Any) -> None:
-        with self._lock:
-            if not self._shown:
-                return
-            moved = self._attempt(action)
-            if moved or self._problem:
-                self._draw()
-                self._client.flush()
-
-    def _attempt(self, action: Any, *, keep_problem: bool = False) -> bool:
-        try:
-            moved = action()
-        except (sqlite3.Error, ValueError) as error:
-            log.exception("a rating could not be saved")
-            self._problem = f"This could not be saved ({error}). Nothing is lost: please try again."
-            return False
-        if not keep_problem:
-            self._problem = ""
-        return moved
 
     def _learn(self, step: Any) -> bool:
         """One press in the lesson; after the last, the first real clip."""
@@ -173,12 +145,6 @@ class Rate:
     def _show_answers(self, visible: bool) -> None:
         if self._answering.visible != visible:
             self._answering.visible = visible
-
-    def _put(self, handle: Any, content: str) -> None:
-        # Setting the same HTML again would restart the animation.
-        if self._content.get(id(handle)) != content:
-            self._content[id(handle)] = content
-            handle.content = content
 
     def _set_keys(self, clip: int | None) -> None:
         if clip != self._keys_for:
