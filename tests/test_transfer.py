@@ -60,6 +60,20 @@ def test_a_lens_sees_another_demo_as_its_own():
     assert flat.axes.shape == (40, 5) and np.count_nonzero(np.abs(flat.axes).sum(axis=0)) == 4
 
 
+def test_a_feature_that_hardly_changed_in_the_first_demo_does_not_make_the_fit_diverge():
+    """Of 40 features, ten changed by a millionth in the first demo, and change freely in the second."""
+    one, two = walk(0), walk(1)
+    one[:, :10] *= 1e-6
+    config = replace(NETWORK, visual_dims=0)
+    start, _ = fit(*world(60, seed=0), through(fit_lens(one, 0), one), config, number=1, seed=0)
+    learner = Learner(small_config(predictor__kind="network", predictor__visual_dims=0), FRAMES, 30.0, start)
+    learner.look_at(two)
+    ratings, frames = world(60, seed=1)
+    tuned, stats = learner.fit(ratings, 1)
+    assert np.isfinite(stats.loss) and stats.loss < 1.6, stats
+    assert np.isfinite(probabilities(tuned, ratings, frames)).all()
+
+
 def test_a_network_from_another_demo_needs_fewer_ratings():
     """Both demos turn along the same direction of the features; the second begins where the first ends."""
     direction = np.random.default_rng(5).normal(size=40)

@@ -93,7 +93,7 @@ class Learner:
         """
         lens = self._lens(features)
         self._view = View(
-            visual=lens.see(features),
+            visual=lens.see(features) if self._start is None else lens.see_other(features),
             track=track,
             basis=track_basis(features, self._fps),
             fps=self._fps,

@@ -27,6 +27,8 @@ from trainer.store import RatedSegment
 CLASSES = 5
 KINDS = {"network": "trainer.network", "metric": "trainer.metric"}
 """Kind to module; each has ``fit(...)`` as below and ``restore(data, config, device)``."""
+_FAR = 5.0
+"""Standard deviations beyond which a visual input of another demo is no farther."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -95,6 +97,14 @@ class Lens:
         centred = features.astype(np.float64) - self.mean
         seen = centred @ self.axes if self.axes.ndim == 2 else centred * self.axes
         return seen.astype(np.float32)
+
+    def see_other(self, features: np.ndarray) -> np.ndarray:
+        """The same for a demo that the lens was not fitted on: no input is beyond ``_FAR``.
+
+        A feature that all but never changed in the one demo has a scale of a million, and may well change
+        in the other: unlimited, such inputs make the fit diverge.
+        """
+        return np.clip(self.see(features), -_FAR, _FAR)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
