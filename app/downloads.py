@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Awaitable, Callable, Generator
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from itertools import islice
@@ -19,8 +19,6 @@ from app.columns import RATINGS
 from trainer.pairs import COMPARISON_COLUMNS
 from trainer.store import Store
 
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
 FILTERS = ("run", "rater", "stage", "value", "choice", "repeat", "left_out")
 """Columns of the ratings by which they can be filtered."""
 _NUMBERS = ("value", "repeat", "left_out")
@@ -29,7 +27,7 @@ _SHOWN = 50
 
 
 class Downloads:
-    """Handlers for a front that lets researchers in alone.
+    """Handlers, for researchers alone.
 
     Args:
         store: Where the data is.
@@ -39,19 +37,13 @@ class Downloads:
     def __init__(self, store: Store, headers: dict[str, str]) -> None:
         self._store, self._headers = store, headers | {"Cache-Control": "no-store"}
 
-    def routes(self, guard: Callable[[Handler], Handler]) -> list[web.RouteDef]:
-        """Where they are. ``guard`` wraps each."""
-        handlers = {
-            "/export.csv": self._csv, "/segments.parquet": self._parquet, "/card.md": self._card,
-            "/preview": self._preview, "/comparisons.csv": self._comparisons,
-        }  # fmt: skip
-        return [web.get(path, guard(handler)) for path, handler in handlers.items()]
-
-    async def _csv(self, request: web.Request) -> web.StreamResponse:
+    async def csv(self, request: web.Request) -> web.StreamResponse:
+        """The ratings."""
         rows = self._store.iter_ratings(**read_filters(request.query))
         return await self._stream(request, "ratings", exports.csv_blocks(rows))
 
-    async def _comparisons(self, request: web.Request) -> web.StreamResponse:
+    async def comparisons(self, request: web.Request) -> web.StreamResponse:
+        """The answers about pairs."""
         rows = self._store.iter_comparisons(read_filters(request.query).get("run"))
         return await self._stream(request, "comparisons", exports.csv_blocks(rows, COMPARISON_COLUMNS))
 
@@ -71,7 +63,8 @@ class Downloads:
         await response.write_eof()
         return response
 
-    async def _parquet(self, request: web.Request) -> web.StreamResponse:
+    async def parquet(self, request: web.Request) -> web.StreamResponse:
+        """The segments behind the clips."""
         run = read_filters(request.query).get("run")
         with tempfile.TemporaryDirectory() as directory:
             file = Path(directory) / "segments.parquet"
@@ -84,7 +77,8 @@ class Downloads:
             await response.write_eof()
         return response
 
-    async def _card(self, request: web.Request) -> web.StreamResponse:
+    async def card(self, request: web.Request) -> web.StreamResponse:
+        """The data card."""
         text = await asyncio.to_thread(card, self._store, read_filters(request.query).get("run"))
         response = self._attachment("card", "md", "text/markdown")
         await response.prepare(request)
@@ -92,7 +86,8 @@ class Downloads:
         await response.write_eof()
         return response
 
-    async def _preview(self, request: web.Request) -> web.StreamResponse:
+    async def preview(self, request: web.Request) -> web.StreamResponse:
+        """A look at the ratings."""
         filters = read_filters(request.query)
         html = await asyncio.to_thread(self._table, filters)
         return web.Response(text=html, content_type="text/html")

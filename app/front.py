@@ -1,10 +1,8 @@
-"""The public HTTP port: who may come in, and what they get.
+"""The public HTTP port: one table of what there is and who may have it.
 
-A link's token becomes a cookie; without a session nothing is served but the login page, its style
-sheet and ``/healthz``. The page itself is Viser's single HTML file with our style sheet and key
-handling added; its WebSocket is passed on to Viser, which listens on the loopback only and builds a
-page for nobody who does not come through here (see ``app.server``). Viser serves nothing else that
-a browser needs, so nothing else is passed on.
+``app.door`` says who asks, ``app.files`` and ``app.downloads`` hand out files, ``app.proxy`` carries
+the page's WebSocket to Viser. The page itself is Viser's single HTML file with our style sheet and
+key handling added.
 """
 
 from __future__ import annotations
@@ -15,70 +13,26 @@ import sqlite3
 import threading
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Protocol
 
-from aiohttp import ClientSession, WSMsgType, web
+from aiohttp import web
 
 from app import assets
 from app.actions import Actions
-from app.downloads import Downloads, Handler
-from app.links import hash_token, new_session_token
+from app.door import RATER, SECURITY_HEADERS, Door, Route
+from app.downloads import Downloads
+from app.files import Files, Filmed
 from app.pictures import Pictures
+from app.proxy import Proxy
 from trainer.errors import UserError
-from trainer.records import Rater, Status
-from trainer.store import Store
-
-RATER_HEADER = "X-Onedemo-Rater"
-SECRET_HEADER = "X-Onedemo-Secret"
-SESSION_HEADER = "X-Onedemo-Session"
-SCHEME_HEADER = "X-Onedemo-Scheme"
-
-_SESSION_DAYS = 30
-_MAX_CLIENT_MESSAGE = 1 << 20
-"""Bytes a browser may send in one message; what the page needs is a few hundred."""
-
-# Viser's script is inline and compressed, hence unsafe-inline and WebAssembly. The one thing that
-# asks for unsafe-eval is its sorter of Gaussian splats, which we do not show: it is refused.
-_SECURITY_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
-        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self'; "
-        "font-src 'self' data:; "
-        # Viser follows ?websocket=ws://elsewhere; this keeps it at home.
-        "connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "X-Frame-Options": "DENY",
-    "Referrer-Policy": "no-referrer",
-}
-
-_RATER = web.RequestKey("rater", Rater)
-_SESSION = web.RequestKey("session", str)
-_MOST_SESSIONS = 8
-"""Sessions of one browser that are looked at."""
+from trainer.records import Status
 
 
-class Trained(Protocol):
+class Trained(Filmed, Protocol):
     """What the front needs to know of a trainer."""
-
-    store: Store
-    run: str
 
     def status(self) -> Status:
         """What the trainer is doing."""
-        ...
-
-    def clip_file(self, clip_id: int) -> Path:
-        """The picture of a clip."""
-        ...
-
-    def pair_file(self, pair_id: int) -> Path:
-        """The picture of a pair."""
-        ...
-
-    def rollout_file(self, iteration: int, suffix: str) -> Path:
-        """The best rollout of an iteration."""
         ...
 
 
@@ -117,7 +71,7 @@ def check_port(host: str, port: int) -> None:
 
 
 class Front:
-    """The public door, in a thread with an event loop of its own.
+    """The public port, in a thread with an event loop of its own.
 
     Args:
         page: The Viser page behind the door; its trainer is the run that is served.
@@ -126,14 +80,16 @@ class Front:
     """
 
     def __init__(self, page: Inside, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        store = page.trainer.store
         self._page = page
-        self._store = page.trainer.store
-        self._actions = Actions(page)
         self._host = host
         self._port = port
+        self._actions = Actions(page)
+        self._files = Files(page)
+        self._downloads = Downloads(store, SECURITY_HEADERS)
+        self._door = Door(store, lambda: self._port)
+        self._proxy = Proxy(page, store)
         self._html = assets.page_html()
-        self._login = (assets.STATIC / "login.html").read_text()
-        self._sockets: set[web.WebSocketResponse] = set()
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._thread: threading.Thread | None = None
@@ -142,6 +98,30 @@ class Front:
     def port(self) -> int:
         """The port it listens on."""
         return self._port
+
+    def routes(self) -> tuple[Route, ...]:
+        """All there is, each with the least role that it asks for."""
+        files, downloads = self._files, self._downloads
+        return (
+            Route("GET", "/login", "stranger", self._door.log_in),
+            Route("GET", "/healthz", "stranger", self._health),
+            *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
+            Route("GET", "/", "annotator", self._home),
+            Route("GET", r"/r/{rater:\d{1,9}}", "annotator", self._page_of),
+            Route("POST", r"/r/{rater:\d{1,9}}/note", "annotator", self._note),
+            Route("POST", r"/r/{rater:\d{1,9}}/do", "researcher", self._do),
+            Route("GET", "/static/{name}", "annotator", files.static),
+            Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
+            Route("GET", r"/pairs/{pair:\d{1,15}}.jpg", "annotator", files.pair),
+            Route("GET", r"/demo/frames/{index:\d{1,6}}.jpg", "annotator", files.demo_frame),
+            Route("GET", r"/demo/examples/{name:[a-z]{1,20}}.jpg", "annotator", files.demo_example),
+            Route("GET", r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", "researcher", files.rollout),
+            Route("GET", "/export.csv", "researcher", downloads.csv),
+            Route("GET", "/comparisons.csv", "researcher", downloads.comparisons),
+            Route("GET", "/segments.parquet", "researcher", downloads.parquet),
+            Route("GET", "/card.md", "researcher", downloads.card),
+            Route("GET", "/preview", "researcher", downloads.preview),
+        )
 
     def start(self) -> str:
         """Opens the port and returns the URL of the front.
@@ -182,128 +162,39 @@ class Front:
             ready.set()
 
     async def _serve(self, ready: threading.Event) -> None:
-        runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=2)
+        application = self._door.application(self.routes())
+        runner = web.AppRunner(application, access_log=None, shutdown_timeout=2)
         await runner.setup()
+        await self._proxy.open()
         try:
-            async with ClientSession() as self._upstream:
-                site = web.TCPSite(runner, self._host, self._port)
-                await site.start()
-                self._port = runner.addresses[0][1]
-                ready.set()
-                await self._stop.wait()
-                for browser in tuple(self._sockets):
-                    await browser.close(code=1001)
+            site = web.TCPSite(runner, self._host, self._port)
+            await site.start()
+            self._port = runner.addresses[0][1]
+            ready.set()
+            await self._stop.wait()
         finally:
+            await self._proxy.close()
             await runner.cleanup()
 
-    def _application(self) -> web.Application:
-        app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
-        app.add_routes(
-            [
-                web.get("/", self._home),
-                web.get(r"/r/{rater:\d{1,9}}", self._page_of),
-                web.post(r"/r/{rater:\d{1,9}}/note", self._note),
-                web.post(r"/r/{rater:\d{1,9}}/do", _for_researchers(self._do)),
-                web.get("/login", self._log_in),
-                web.get("/healthz", self._health),
-                web.get("/static/{name}", self._static),
-                web.get(r"/clips/{clip:\d{1,15}}.jpg", self._clip),
-                web.get(r"/pairs/{pair:\d{1,15}}.jpg", self._pair),
-                web.get(r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", _for_researchers(self._rollout)),
-                web.get(r"/demo/frames/{index:\d{1,6}}.jpg", self._demo_frame),
-                web.get(r"/demo/examples/{name:[a-z]{1,20}}.jpg", self._demo_example),
-                *Downloads(self._store, _SECURITY_HEADERS).routes(_for_researchers),
-            ]
-        )
-        return app
-
-    # Who may come in
-
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        try:
-            await self._recognise(request)
-            if _RATER not in request and not _is_public(request.path):
-                response: web.StreamResponse = self._login_page(401)
-            else:
-                response = await handler(request)
-        except web.HTTPException as problem:
-            response = problem
-        if not response.prepared:
-            response.headers.update(_SECURITY_HEADERS)
-            response.headers.setdefault("Cache-Control", "no-store")
-        if isinstance(response, web.HTTPException):
-            raise response
-        return response
-
-    async def _recognise(self, request: web.Request) -> None:
-        """Notes who asks. One browser may hold sessions of several raters, each with its own tabs."""
-        known: list[tuple[Rater, str]] = []
-        cookies = [value for name, value in request.cookies.items() if name.startswith(self._cookie(""))]
-        for token in cookies[:_MOST_SESSIONS]:
-            digest = hash_token(token)
-            rater = await asyncio.to_thread(self._store.rater_of, digest, "session")
-            if rater is not None:
-                known.append((rater, digest))
-        if "rater" in request.match_info:  # the page, and its WebSocket, of this rater alone
-            wanted = int(request.match_info["rater"])
-            known = [(rater, digest) for rater, digest in known if rater.id == wanted]
-        # Elsewhere the most that any of the sessions may do.
-        known.sort(key=lambda entry: entry[0].role != "researcher")
-        if known:
-            request[_RATER], request[_SESSION] = known[0]
-
-    def _cookie(self, rater: int | str) -> str:
-        # Browsers share cookies between the ports of a host; two studies on one machine must not.
-        return f"onedemo-{self._port}-{rater}"
-
-    def _login_page(self, status: int) -> web.Response:
-        notes = {
-            200: "",
-            401: "",
-            403: "This link does not work. It may be incomplete, or it was withdrawn.",
-        }
-        html = self._login.replace("<!-- note -->", notes[status])
-        return web.Response(text=html, content_type="text/html", status=status)
-
-    async def _log_in(self, request: web.Request) -> web.StreamResponse:
-        token = request.query.get("token", "")
-        if not token:
-            return self._login_page(200)
-        rater = await asyncio.to_thread(self._store.rater_of, hash_token(token), "link")
-        if rater is None:
-            return self._login_page(403)
-        session = new_session_token()
-        await asyncio.to_thread(self._store.add_token, hash_token(session), rater.id, "session")
-        response = web.HTTPSeeOther(f"/r/{rater.id}")
-        # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
-        response.set_cookie(
-            self._cookie(rater.id),
-            session,
-            max_age=_SESSION_DAYS * 86400,
-            httponly=True,
-            samesite="Lax",
-            secure=request.secure,
-            path="/",
-        )
-        return response
-
-    # What they get
+    # What is nobody else's
 
     async def _home(self, request: web.Request) -> web.StreamResponse:
-        raise web.HTTPSeeOther(f"/r/{request[_RATER].id}")
+        raise web.HTTPSeeOther(f"/r/{request[RATER].id}")
 
     async def _page_of(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Upgrade", "").lower() == "websocket":
-            return await self._socket(request)
+            return await self._proxy.socket(request)
         return web.Response(text=self._html, content_type="text/html")
 
+    async def _health(self, request: web.Request) -> web.Response:
+        status = self._page.trainer.status()
+        healthy = status.phase != "failed"
+        return web.json_response({"ok": healthy, "version": version("onedemo"), "phase": status.phase})
+
     async def _note(self, request: web.Request) -> web.Response:
-        if not _same_origin(request):
-            raise web.HTTPForbidden(text="This page can only be used from its own address.")
         try:
             note = read_note(await request.json())
-            noted = await asyncio.to_thread(partial(self._page.note, request[_RATER].id, **note))
+            noted = await asyncio.to_thread(partial(self._page.note, request[RATER].id, **note))
         except ValueError as error:
             raise web.HTTPBadRequest(text=f"This could not be noted: {error}.") from None
         except sqlite3.Error as error:
@@ -313,140 +204,13 @@ class Front:
         return web.Response(status=204)
 
     async def _do(self, request: web.Request) -> web.Response:
-        if not _same_origin(request):
-            raise web.HTTPForbidden(text="This page can only be used from its own address.")
         try:
-            await asyncio.to_thread(self._actions.do, request[_RATER], await request.json())
+            await asyncio.to_thread(self._actions.do, request[RATER], await request.json())
         except (ValueError, UserError) as error:
             raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
         except sqlite3.Error as error:
             raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
         return web.Response(status=204)
-
-    async def _health(self, request: web.Request) -> web.Response:
-        status = self._page.trainer.status()
-        healthy = status.phase != "failed"
-        return web.json_response({"ok": healthy, "version": version("onedemo"), "phase": status.phase})
-
-    async def _static(self, request: web.Request) -> web.StreamResponse:
-        path = assets.STATIC / request.match_info["name"]
-        if path.parent != assets.STATIC or path.suffix not in assets.SERVED or not path.is_file():
-            raise web.HTTPNotFound()
-        return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
-
-    async def _clip(self, request: web.Request) -> web.StreamResponse:
-        number = int(request.match_info["clip"])
-        clip = await asyncio.to_thread(self._store.clip, number)
-        if clip is None or clip.run != self._page.trainer.run:
-            raise web.HTTPNotFound()
-        path = self._page.trainer.clip_file(number)
-        if not path.is_file():
-            raise web.HTTPNotFound()
-        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
-
-    async def _pair(self, request: web.Request) -> web.StreamResponse:
-        number = int(request.match_info["pair"])
-        run = await asyncio.to_thread(self._store.pair_run, number)
-        path = self._page.trainer.pair_file(number)
-        if run != self._page.trainer.run or not path.is_file():
-            raise web.HTTPNotFound()
-        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
-
-    async def _rollout(self, request: web.Request) -> web.StreamResponse:
-        iteration, suffix = int(request.match_info["iteration"]), request.match_info["suffix"]
-        try:
-            path = await asyncio.to_thread(self._page.trainer.rollout_file, iteration, suffix)
-        except FileNotFoundError:
-            raise web.HTTPNotFound() from None
-        kind = {"jpg": "image/jpeg", "webm": "video/webm"}[suffix]
-        return web.FileResponse(path, headers=_KEEP | {"Content-Type": kind})
-
-    async def _demo_frame(self, request: web.Request) -> web.StreamResponse:
-        frames = await asyncio.to_thread(self._page.pictures.frames)
-        index = int(request.match_info["index"])
-        if index >= len(frames):
-            raise web.HTTPNotFound()
-        return web.Response(body=frames[index], content_type="image/jpeg", headers=_KEEP)
-
-    async def _demo_example(self, request: web.Request) -> web.StreamResponse:
-        examples = await asyncio.to_thread(self._page.pictures.examples)
-        example = examples.get(request.match_info["name"])
-        if example is None:
-            raise web.HTTPNotFound()
-        return web.Response(body=example, content_type="image/jpeg", headers=_KEEP)
-
-    async def _socket(self, request: web.Request) -> web.StreamResponse:
-        if not _same_origin(request):
-            raise web.HTTPForbidden(text="This page can only be used from its own address.")
-        offered = request.headers.get("Sec-WebSocket-Protocol", "")
-        protocols = [name.strip() for name in offered.split(",") if name.strip()]
-        scheme = "dark" if request.cookies.get("scheme") == "dark" else "light"
-        # Only what is named here goes on: nothing of the client's own headers reaches Viser.
-        identity = {
-            RATER_HEADER: str(request[_RATER].id),
-            SECRET_HEADER: self._page.secret,
-            SESSION_HEADER: request[_SESSION],
-            SCHEME_HEADER: scheme,
-        }
-        inside = await self._upstream.ws_connect(
-            f"http://127.0.0.1:{self._page.port}/",
-            protocols=protocols,
-            headers=identity,
-            max_msg_size=0,
-        )
-        async with inside:
-            outside = web.WebSocketResponse(
-                protocols=protocols, heartbeat=30, max_msg_size=_MAX_CLIENT_MESSAGE, compress=False
-            )
-            await outside.prepare(request)
-            self._sockets.add(outside)
-            try:
-                await self._pump(request[_SESSION], inside, outside)
-            finally:
-                self._sockets.discard(outside)
-                await outside.close()
-        return outside
-
-    async def _pump(self, session: str, inside, outside: web.WebSocketResponse) -> None:
-        tasks = [
-            asyncio.ensure_future(_forward(inside, outside)),
-            asyncio.ensure_future(_forward(outside, inside)),
-            asyncio.ensure_future(self._until_revoked(session)),
-        ]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _until_revoked(self, session: str) -> None:
-        look = partial(self._store.rater_of, session, "session")
-        while await asyncio.to_thread(look) is not None:
-            await asyncio.sleep(5)
-
-
-_KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
-"""Addresses of what differs between runs or demos end in ?v= and what they are of."""
-
-
-async def _forward(source, target) -> None:
-    async for message in source:
-        if message.type is WSMsgType.BINARY:
-            await target.send_bytes(message.data)
-        elif message.type is WSMsgType.TEXT:
-            await target.send_str(message.data)
-        else:
-            return
-
-
-def _for_researchers(handler: Handler) -> Handler:
-    async def checked(request: web.Request) -> web.StreamResponse:
-        if request[_RATER].role != "researcher":
-            raise web.HTTPForbidden(text="Only researchers may do that.")
-        return await handler(request)
-
-    return checked
 
 
 def read_note(body: Any) -> dict[str, Any]:
@@ -468,15 +232,6 @@ def read_note(body: Any) -> dict[str, Any]:
     if mark is not None and not (len(numbers) == 2 and all(type(x) in (int, float) for x in numbers)):
         raise ValueError("a mark is two numbers")
     return {"clip": clip, "mark": None if mark is None else (float(mark[0]), float(mark[1]))}
-
-
-def _is_public(path: str) -> bool:
-    return path in ("/login", "/healthz") or path in assets.PUBLIC
-
-
-def _same_origin(request: web.Request) -> bool:
-    origin = request.headers.get("Origin", "")
-    return origin in (f"http://{request.host}", f"https://{request.host}")
 
 
 def _explain(error: BaseException, host: str, port: int) -> UserError:

@@ -23,9 +23,9 @@ from app import data, guide, rate, runs, watch
 from app.assignment import Again, Ask, Assignment
 from app.compare import Compare
 from app.desk import Desk, Mark
-from app.front import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from app.live import Live
 from app.pictures import Pictures
+from app.proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from app.session import Session, TabMaker
 from app.study import Study
 from trainer.records import Rater

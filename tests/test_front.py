@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import aiohttp
@@ -12,6 +13,7 @@ import viser
 from aside import run
 
 from app import exports
+from app.door import Door
 from app.front import Front, check_port
 from app.links import issue_link, read_secret
 from trainer.errors import UserError
@@ -71,6 +73,68 @@ def test_nothing_without_a_session(site, path):
     assert b"Please open your link" in body
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
     assert fetch(site.url, path, cookies={f"onedemo-{site.front.port}-1": "guess"})[0] == 401
+
+
+EXAMPLES = {
+    "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": "far", "iteration": "1", "suffix": "jpg",
+}  # fmt: skip
+"""What the places in a route's path may be; the rater is the annotator."""
+STRANGERS_MAY = {"/login", "/healthz", "/static/login.css", "/static/icon.svg"}
+ANNOTATORS_MAY = {
+    "/", "/r/2", "/r/2/note", "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
+    "/demo/examples/far.jpg",
+}  # fmt: skip
+
+
+def status_of(url, method, path, link):
+    async def go():
+        jar = aiohttp.CookieJar(unsafe=True)
+        async with aiohttp.ClientSession(cookie_jar=jar) as session:
+            if link:
+                await (await session.get(link)).read()
+            async with session.request(
+                method, url + path, headers={"Origin": url}, data=b"{}", allow_redirects=False
+            ) as response:
+                return response.status
+
+    return run(go())
+
+
+@pytest.mark.parametrize("role", ["stranger", "annotator", "researcher"])
+def test_every_route_asks_for_its_role(site, role):
+    """Which routes a role gets is written here once more: a new one must be added on purpose."""
+    for route in site.front.routes():
+        path = "/static/page.css" if route.path == "/static/{name}" else route.path
+        for name, example in EXAMPLES.items():
+            path = re.sub(rf"\{{{name}(:[^/]*?)?\}}(?=[./]|$)", example, path)
+        if role == "researcher":
+            path = path.replace("/r/2", "/r/1")
+        plain = path.replace("/r/1", "/r/2")
+        least = (
+            "stranger" if plain in STRANGERS_MAY
+            else "annotator" if plain in ANNOTATORS_MAY else "researcher"
+        )  # fmt: skip
+        assert route.role == least, f"{path} asks for {route.role}"
+        status = status_of(site.url, route.method, path, site.links.get(role))
+        if least == "stranger" or role == "researcher" or role == least:
+            assert status in (200, 204, 303, 400, 404), f"{path} for a {role}: {status}"
+            assert status != 404 or path in ("/pairs/1.jpg", "/rollouts/1.jpg")
+        else:
+            assert status == (401 if role == "stranger" else 403), f"{path} for a {role}"
+
+
+def test_a_route_without_a_role_is_for_nobody(site):
+    door = Door(site.trainer.store, lambda: 0)
+    routes = [route for route in site.front.routes() if route.path == "/healthz"]
+    application = door.application(routes)
+    application.router.add_get("/forgotten", routes[0].handler.__func__)
+    from aiohttp.test_utils import TestClient, TestServer
+
+    async def go():
+        async with TestClient(TestServer(application)) as client:
+            return (await client.get("/forgotten")).status
+
+    assert run(go()) == 403
 
 
 def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
