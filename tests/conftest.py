@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,18 +12,6 @@ import pytest
 
 # Before anything imports mujoco: there is no screen.
 os.environ.setdefault("MUJOCO_GL", "egl")
-
-CHROMIUM_FLAGS = [
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
 
 
 @pytest.fixture(scope="session")
@@ -36,8 +23,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
-    names = ("chromium", "chromium-browser")
-    path = next((found for name in names if (found := shutil.which(name))), None)
+    from trainer.bench.painted import CHROMIUM_FLAGS, find_chromium
+
+    path = find_chromium()
     if path is None:
         reason = "there is no Chromium: install the package chromium"
         if os.environ.get("CI"):

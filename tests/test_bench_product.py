@@ -3,38 +3,57 @@
 from __future__ import annotations
 
 import math
+import re
+import shutil
 from dataclasses import replace
 
 import aside
 import pytest
 
-from trainer.bench import product
+from trainer.bench import crowd, painted, product
 from trainer.bench.annotators import Press, browser_session, open_tab
-from trainer.bench.serving import Server, check_counts
+from trainer.bench.serving import Server, check_counts, give, stocked
 
 pytestmark = pytest.mark.seam
 
 
 @pytest.fixture(scope="module")
-def data_dir(tmp_path_factory):
-    """Shared, so that the demo is looked at once."""
-    return tmp_path_factory.mktemp("bench") / "data"
+def data_dir(tmp_path_factory, robots):
+    """Shared, so that the demo is looked at once; what the robot looks like is known, roughly."""
+    directory = tmp_path_factory.mktemp("bench") / "data"
+    shutil.copytree(robots, directory / "robots")
+    return directory
 
 
-def test_presses_are_timed_and_counted(data_dir):
-    # Raises if a press is lost or doubled.
-    figures = aside.run(product.press_times(data_dir, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}))
-    assert [figure.name for figure in figures] == ["press_1_annotator", "press_4_annotators"]
-    for figure in figures:
+def test_presses_are_timed_until_the_next_clip_is_there_and_painted(data_dir, chromium):
+    """One server for all of it. Raises if a press is lost or doubled."""
+
+    async def all_of_it():
+        async with stocked(data_dir, presses=80, people=5) as study:
+            return (
+                await product.press_times(study, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}),
+                await crowd.crowd(study, people=5, every_s=1.0, seconds=5.0),
+                await painted.press_to_paint(study, turns=1, presses=4),
+            )
+
+    pressed, together, seen = aside.run(all_of_it())
+    assert [figure.name for figure in pressed] == ["press_1_annotator", "press_4_annotators"]
+    for figure in pressed:
         assert math.isfinite(figure.value) and figure.reach == 2 and not figure.at_least
         assert all(0 < p95 < 20_000 for side in figure.sides.values() for p95 in side)
+    figures = {figure.name: figure for figure in together}
+    assert figures["crowd_lost"].met and re.search(r"of ([5-9]|1\d|2[0-5])$", figures["crowd_lost"].what)
+    assert 0 < figures["crowd_press_median_ms"].value <= figures["crowd_press_ms"].value < 20_000
+    assert 50 < figures["crowd_memory_start_mib"].value < 4000
+    training, paused = seen
+    assert training.reach == 100 and 0 < paused.value < 20_000 and 0 < training.value < 20_000
 
 
 def test_lost_doubled_and_changed_ratings_are_noticed(data_dir):
     async def rate_three(server: Server) -> list[Press]:
         async with browser_session() as session:
             tab = await open_tab(session, server.links["annotator"])
-            await product._give(tab, 3)
+            await give(tab, 3)
             await tab.close()
             return tab.presses
 

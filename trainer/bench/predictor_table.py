@@ -148,9 +148,9 @@ _DEFINITIONS = (
     f"**Calibration error**: expected |chance - share| of being rated 3 or more, over {BINS} equally wide "
     "bins of the chance, points (Naeini et al. 2015).",
     "**Always the same**: what it scores to predict the most frequent rating of those fitted for all clips.",
-    "**All frame features**: as in the paper, whose network sees all features of a frame; the five "
-    "variants here see 24 principal components of them. **Ordinal loss**: the paper's choice, with "
-    "ratings next to the one given counting as half right; **3 networks** of it, averaged. **Metric**: "
+    "**Principal components**: the paper's choice, but its network sees 24 principal components of a "
+    "frame's features and not all of them. **Ordinal loss**: the paper's choice, with ratings next to the "
+    "one given counting as half right; **3 networks** of it, averaged. **Metric**: "
     "onedemo's, a learned distance between the robot's pose and the pose in the frame, as a model of the "
     "robot's looks sees it that was learned from its own pictures.",
 )

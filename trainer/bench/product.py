@@ -11,27 +11,19 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-from aiohttp import ClientSession
 
-from trainer.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
+from trainer.bench.annotators import Press, browser_session, open_tab
 from trainer.bench.figures import Figure, Result, Skipped, ratio, single
-from trainer.bench.serving import Server, Supply, annotator_link, check_counts, serving
-from trainer.store import Store
+from trainer.bench.serving import Server, Stocked, bring, check_counts, give, reach, serving, stocked
 
 CROWD = 50
 _EVERY_S = {1: 0.4, CROWD: 4.0}
 """Seconds from press to press of each person, by how many they are; the one makes haste to give figures."""
-_PATIENCE_S = 120.0
-_IN_HAND = 2
-"""Clips at each open page: one on screen, one fetched ahead."""
-_SPARE = 50
-"""Clips beyond those, for the second until more are brought."""
 
 
 def measure(quick: bool) -> list[Result]:
@@ -48,10 +40,8 @@ def measure(quick: bool) -> list[Result]:
             help_time(3 if quick else 9),
             *asyncio.run(default_run(data_dir, quick=quick)),
             asyncio.run(start_time(data_dir, 1 if quick else 5)),
-            *asyncio.run(
-                press_times(data_dir, turns=1 if quick else 6, seconds=2.0 if quick else 10.0)
-            ),
-        ]  # fmt: skip
+            *asyncio.run(_presses(data_dir, *((1, 2.0) if quick else (6, 10.0)))),
+        ]
 
 
 def help_time(repetitions: int) -> Figure:
@@ -93,14 +83,14 @@ async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
         async with browser_session() as session:
             watch = await open_tab(session, server.links["researcher"])
             rate = await open_tab(session, server.links["annotator"])
-            await _give(rate, pretrain)
-            await _reach(lambda: _iterations(server) >= 1, "an iteration")
+            await give(rate, pretrain)
+            await reach(lambda: _iterations(server) >= 1, "an iteration")
             for _ in range(online):
                 await asyncio.sleep(1.0)
-                await _give(rate, 1)
+                await give(rate, 1)
             practised = rate.presses[pretrain:]
-            await _reach(lambda: len(_delays(server, practised)[1]) == online, "a policy that knows all")
-            await _reach(lambda: _iterations(server) >= iterations, "iterations")
+            await reach(lambda: len(_delays(server, practised)[1]) == online, "a policy that knows all")
+            await reach(lambda: _iterations(server) >= iterations, "iterations")
             to_snapshot, to_policy = _delays(server, practised)
             check_counts(server, rate.presses)
             peak = server.peak_mib()
@@ -117,13 +107,19 @@ async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
     ]  # fmt: skip
 
 
+async def _presses(data_dir: Path, turns: int, seconds: float) -> list[Result]:
+    presses = sum(2 * turns * seconds * people / pause for people, pause in _EVERY_S.items())
+    async with stocked(data_dir, presses=int(presses), people=CROWD) as study:
+        return await press_times(study, turns=turns, seconds=seconds)
+
+
 async def press_times(
-    data_dir: Path, *, turns: int, seconds: float, every_s: dict[int, float] = _EVERY_S
+    study: Stocked, *, turns: int, seconds: float, every_s: dict[int, float] = _EVERY_S
 ) -> list[Result]:
     """Key press to next clip, while the trainer runs and while it is paused.
 
     Args:
-        data_dir: A new one, or one that was used.
+        study: With clips in stock for all.
         turns: Of each side.
         seconds: Of a turn.
         every_s: Seconds from press to press of each person, by how many they are, ascending.
@@ -131,39 +127,16 @@ async def press_times(
     Raises:
         RuntimeError: If a press was lost or doubled.
     """
-    needed = sum(2 * turns * seconds * people / pause for people, pause in every_s.items())
-    # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
-    settings = ["ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000"]
     results: list[Result] = []
-    with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
-        before = store.last_event()
-        async with browser_session() as session:
-            tabs = [await open_tab(session, server.links["annotator"])]
-            await _give(tabs[0], 10)
-            await _bring(session, server, "paused")
-            run = store.runs()[-1]["id"]
-            await _reach(lambda: store.waiting_clips(run), "clips that are drawn")
-            supply = Supply(
-                store, run, int(1.2 * needed) + sum(_IN_HAND * people + _SPARE for people in every_s)
-            )
-            for people, pause in every_s.items():
-                supply.fill(_IN_HAND * people + _SPARE)
-                for number in range(len(tabs), people):
-                    link = annotator_link(server, store, f"annotator {number}")
-                    tabs.append(await open_tab(session, link))
-                for tab in tabs:
-                    await tab.until(lambda tab=tab: tab.clip, "a clip")
-                filling = asyncio.create_task(supply.keep(_IN_HAND * people + _SPARE))
-                p95: dict[str, list[float]] = {"online": [], "paused": []}
-                for _ in range(turns):
-                    for phase, taken in p95.items():
-                        await _bring(session, server, phase)
-                        taken.append(await _percentile(tabs, pause, seconds))
-                filling.cancel()
-                results.append(_press_figure(people, pause, p95))
-            check_counts(server, [press for tab in tabs for press in tab.presses], after=before)
-            for tab in tabs:
-                await tab.close()
+    for people, pause in every_s.items():
+        await study.open(people)
+        p95: dict[str, list[float]] = {"online": [], "paused": []}
+        for _ in range(turns):
+            for phase, taken in p95.items():
+                await bring(study.session, study.server, phase)
+                taken.append(float(np.percentile(await study.rate(pause, seconds), 95)))
+        results.append(_press_figure(people, pause, p95))
+    study.check()
     return results
 
 
@@ -176,40 +149,6 @@ def _press_figure(people: int, pause: float, p95: dict[str, list[float]]) -> Fig
         equal="one server and its open pages by turns; clips drawn before, copies of a few; the clock stops "
         "when the next clip and its picture are there",
     )  # fmt: skip
-
-
-async def _percentile(tabs: Sequence[Tab], pause: float, seconds: float) -> float:
-    """The 95th percentile of a turn, milliseconds."""
-    before = [len(tab.presses) for tab in tabs]
-    await rate_for(tabs, every_s=pause, seconds=seconds)
-    taken = [press.seconds for tab, n in zip(tabs, before, strict=True) for press in tab.presses[n:]]
-    return 1000 * float(np.percentile(taken, 95))
-
-
-async def _give(tab: Tab, count: int) -> None:
-    """Rates so many clips as they come, however long they take."""
-    for _ in range(count):
-        await _reach(lambda: tab.clip, "a clip to rate")
-        await tab.rate(rating(tab))
-
-
-async def _bring(session: ClientSession, server: Server, phase: str) -> None:
-    """Pauses or resumes through the researcher's page and waits until it is so."""
-    if await asyncio.to_thread(server.phase) == phase:
-        return
-    page = await open_tab(session, server.links["researcher"])
-    await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
-    await page.press("alt+P")
-    await _reach(lambda: server.phase() == phase, f"the phase {phase}")
-    await page.close()
-
-
-async def _reach(condition: Callable[[], object], what: str) -> None:
-    end = time.monotonic() + _PATIENCE_S
-    while not await asyncio.to_thread(condition):
-        if time.monotonic() > end:
-            raise RuntimeError(f"waited {_PATIENCE_S:.0f} s in vain for {what}")
-        await asyncio.sleep(0.1)
 
 
 def _iterations(server: Server) -> int:

@@ -11,14 +11,24 @@ import secrets
 import sqlite3
 import subprocess
 import sys
+import time
 import urllib.request
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-from trainer.bench.annotators import Press
+from aiohttp import ClientSession
+
+from trainer.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
 from trainer.store import FILE_NAME, NewClip, Store
+
+_PATIENCE_S = 300.0
+_IN_HAND = 2
+"""Clips at each open page: one on screen, one fetched ahead."""
+_SPARE = 50
+"""Clips beyond those, for the second until more are brought."""
 
 
 class Server:
@@ -66,16 +76,23 @@ class Server:
 
     def peak_mib(self) -> float:
         """The most memory the process has had at once, MiB (Linux)."""
-        status = Path(f"/proc/{self._child.pid}/status").read_text()
-        found = re.search(r"VmHWM:\s+(\d+) kB", status)
-        assert found is not None, "the kernel tells no peak"
-        return int(found[1]) / 1024
+        return self._memory("VmHWM")
+
+    def resident_mib(self) -> float:
+        """The memory the process has just now, MiB (Linux)."""
+        return self._memory("VmRSS")
 
     def rows(self, sql: str, *values: object) -> list[tuple]:
         """What its database answers, on a read-only connection of our own."""
         uri = f"{(self.data_dir / FILE_NAME).absolute().as_uri()}?mode=ro"
         with closing(sqlite3.connect(uri, uri=True, timeout=10)) as db:
             return db.execute(sql, values).fetchall()
+
+    def _memory(self, what: str) -> float:
+        status = Path(f"/proc/{self._child.pid}/status").read_text()
+        found = re.search(rf"{what}:\s+(\d+) kB", status)
+        assert found is not None, f"the kernel tells no {what}"
+        return int(found[1]) / 1024
 
     def close(self) -> None:
         """Ends the process as ``kill`` would; by force if it takes half a minute."""
@@ -172,3 +189,109 @@ def check_counts(server: Server, presses: Sequence[Press], *, after: int = 0) ->
             f"{pressed.total()} presses became {events.total()} events: "
             f"lost {dict(pressed - events)}, too many {dict(events - pressed)}"
         )
+
+
+async def reach(condition: Callable[[], object], what: str) -> None:
+    """Waits until something is so, however slow the machine is.
+
+    Raises:
+        RuntimeError: If it takes more than five minutes.
+    """
+    end = time.monotonic() + _PATIENCE_S
+    while not await asyncio.to_thread(condition):
+        if time.monotonic() > end:
+            raise RuntimeError(f"waited {_PATIENCE_S:.0f} s in vain for {what}")
+        await asyncio.sleep(0.1)
+
+
+async def give(tab: Tab, count: int) -> None:
+    """Rates so many clips as they come, however long they take."""
+    for _ in range(count):
+        await reach(lambda: tab.clip, "a clip to rate")
+        await tab.rate(rating(tab))
+
+
+async def bring(session: ClientSession, server: Server, phase: str) -> None:
+    """Pauses or resumes through the researcher's page and waits until it is so."""
+    if await asyncio.to_thread(server.phase) == phase:
+        return
+    page = await open_tab(session, server.links["researcher"])
+    await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
+    await page.press("alt+P")
+    await reach(lambda: server.phase() == phase, f"the phase {phase}")
+    await page.close()
+
+
+@dataclass
+class Stocked:
+    """A server with drawn clips in stock, and people who rate them. Made by ``stocked``."""
+
+    server: Server
+    store: Store
+    session: ClientSession
+    supply: Supply
+    tabs: list[Tab]
+    before: int
+    """The last event before anybody rated."""
+
+    def fill(self, clips: int) -> None:
+        """Lets so many clips wait to be rated, beside those at open pages."""
+        self.supply.fill(_IN_HAND * len(self.tabs) + clips)
+
+    async def open(self, people: int) -> None:
+        """Opens pages until so many people are there, each with a clip."""
+        self.supply.fill(_IN_HAND * people + _SPARE)
+        for number in range(len(self.tabs), people):
+            link = annotator_link(self.server, self.store, f"annotator {number}")
+            self.tabs.append(await open_tab(self.session, link))
+        for tab in self.tabs:
+            await tab.until(lambda tab=tab: tab.clip, "a clip")
+
+    async def rate(self, every_s: float, seconds: float) -> list[float]:
+        """Lets all rate for a while, as ``rate_for``.
+
+        Returns:
+            Of each press, the time until the next clip and its picture were there, ms.
+        """
+        told = [len(tab.presses) for tab in self.tabs]
+        filling = asyncio.create_task(self.supply.keep(_IN_HAND * len(self.tabs) + _SPARE))
+        try:
+            await rate_for(self.tabs, every_s=every_s, seconds=seconds)
+        finally:
+            filling.cancel()
+        pairs = zip(self.tabs, told, strict=True)
+        return [1000 * press.seconds for tab, n in pairs for press in tab.presses[n:]]
+
+    def iterations(self) -> int:
+        """Iterations of practice in the database, of all runs."""
+        return self.server.rows("SELECT COUNT(*) FROM iterations")[0][0]
+
+    def check(self) -> None:
+        """As ``check_counts``, of all that was rated here."""
+        presses = [press for tab in self.tabs for press in tab.presses]
+        check_counts(self.server, presses, after=self.before)
+
+
+@asynccontextmanager
+async def stocked(data_dir: Path, *, presses: int, people: int) -> AsyncIterator[Stocked]:
+    """A server that practises and need not draw: clips in stock are copies of a few.
+
+    Args:
+        data_dir: A new one, or one that was used.
+        presses: How many there will be, about.
+        people: How many there will be at once, at most.
+    """
+    # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
+    settings = ["ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000"]
+    with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
+        before = store.last_event()
+        async with browser_session() as session:
+            tabs = [await open_tab(session, server.links["annotator"])]
+            await give(tabs[0], 10)
+            await bring(session, server, "paused")
+            run = store.runs()[-1]["id"]
+            await reach(lambda: store.waiting_clips(run), "clips that are drawn")
+            supply = Supply(store, run, int(1.2 * presses) + _IN_HAND * people + 2 * _SPARE)
+            yield Stocked(server, store, session, supply, tabs, before)
+            for tab in tabs:
+                await tab.close()

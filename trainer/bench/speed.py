@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from trainer.bench.figures import Result, Skipped
 from trainer.bench.physics import MISSING
 
-PARTS = ("physics", "training", "sb3", "fitting", "pictures", "data", "product", "warp")
+PARTS = ("physics", "training", "sb3", "fitting", "pictures", "data", "product", "crowd", "painted", "warp")
 """Modules of ``trainer.bench``; each has ``measure(quick) -> list[Result]``."""
 
 
