@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from app.bench import add_commands
+from app.cli_care import add_care_commands
 from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
 from trainer.errors import UserError
 
@@ -113,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         add_data_dir(command)
 
     add_data_commands(commands, _command)
+    add_care_commands(commands, _command)
 
     baseline = _command(commands, "baseline", None, "what the method is compared with")
     actions = baseline.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser)

@@ -1,0 +1,252 @@
+"""What is wrong with an installation and its data directory, in plain words. Changes nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sqlite3
+import sys
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from packaging.requirements import Requirement
+
+from trainer.demos import list_demos
+from trainer.encoders import make_encoder
+from trainer.errors import UserError
+from trainer.migrations import STEPS, check_version
+from trainer.render import HEIGHT, WIDTH, RenderThread
+from trainer.store import FILE_NAME
+from trainer.transfer import snapshot_file
+
+_LITTLE_ROOM = 1 << 30
+_NAMED = 3
+"""Files of a kind that are named; of more, the number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    ok: bool
+    said: str
+    """What was found and, if it is not well, what would help."""
+
+
+def examine(data_dir: Path) -> Iterator[Finding]:
+    """Looks at everything, one thing after another; a check that fails is a finding, too.
+
+    Args:
+        data_dir: May not be there yet: then only the installation is looked at.
+    """
+    checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
+        ("packages", _packages),
+        ("pictures", _pictures),
+        ("image network", lambda: _encoder(data_dir)),
+        ("disk", lambda: _disk(data_dir)),
+    ]
+    if (data_dir / FILE_NAME).exists():
+        checks += [
+            ("database", lambda: _database(data_dir)),
+            ("files", lambda: _files(data_dir)),
+            ("demonstrations", lambda: _demos(data_dir)),
+        ]
+    for what, check in checks:
+        try:
+            yield from check()
+        except (UserError, OSError, sqlite3.Error) as error:
+            yield Finding(what, False, str(error))
+    if not (data_dir / FILE_NAME).exists():
+        yield Finding("database", True, f"none in {data_dir} yet")
+
+
+def _packages() -> Iterator[Finding]:
+    wrong = []
+    for line in metadata.requires("onedemo") or []:
+        wanted = Requirement(line)
+        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            there = metadata.version(wanted.name)
+        except metadata.PackageNotFoundError:
+            wrong.append(f"{wanted.name} is missing, {wanted.specifier} is needed")
+            continue
+        if not wanted.specifier.contains(there, prereleases=True):
+            wrong.append(f"{wanted.name} is {there}, {wanted.specifier} is needed")
+    python = sys.version.split()[0]
+    if wrong:
+        yield Finding("packages", False, f"{'; '.join(wrong)}: install onedemo again")
+    else:
+        yield Finding(
+            "packages", True, f"onedemo {metadata.version('onedemo')}, Python {python}, all as needed"
+        )
+
+
+def _pictures() -> Iterator[Finding]:
+    qpos = np.array([[0.0, 1.25, 0.0, 0.0, 0.0, 0.0]])
+    with RenderThread() as drawing:
+        (picture,) = drawing.render(qpos).result()
+    if picture.std() < 1:
+        yield Finding(
+            "pictures", False, "OpenGL draws nothing but one colour: update the graphics driver (Mesa)"
+        )
+    else:
+        yield Finding("pictures", True, f"the robot can be drawn ({WIDTH} x {HEIGHT})")
+
+
+def _encoder(data_dir: Path) -> Iterator[Finding]:
+    encoder = make_encoder("efficientnet-lite0")
+    features = encoder.encode(iter([np.zeros((HEIGHT, WIDTH, 3), np.uint8)]))
+    if features.shape != (1, encoder.dims) or not np.isfinite(features).all():
+        yield Finding("image network", False, f"{encoder.name} gives no features: install onedemo again")
+        return
+    kept = [*data_dir.glob("demos/*/features-*.npz"), *data_dir.glob("robots/*.npz")]
+    broken = [path for path in kept if _zip_fault(path)]
+    yield Finding(
+        "image network", not broken,
+        f"{_name(broken)} damaged: delete it, it is made anew" if broken
+        else f"{encoder.name} works; {_count(len(kept), 'file')} of features kept",
+    )  # fmt: skip
+
+
+def _disk(data_dir: Path) -> Iterator[Finding]:
+    there = data_dir.absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if not os.access(there, os.W_OK):
+        yield Finding(
+            "disk", False, f"{there} cannot be written to: change its owner or choose another --data-dir"
+        )
+    elif free < _LITTLE_ROOM:
+        yield Finding(
+            "disk", False, f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about 1 GB"
+        )
+    else:
+        yield Finding("disk", True, f"{free / 1e9:,.0f} GB free")
+    secret = data_dir / "link-secret"
+    if secret.exists() and secret.stat().st_mode & 0o077:
+        yield Finding(
+            "secret", False, f"others may read {secret}, which is behind all links: chmod 600 {secret}"
+        )
+
+
+def _database(data_dir: Path) -> Iterator[Finding]:
+    path = data_dir / FILE_NAME
+    with closing(_open(path)) as db:
+        try:
+            version = check_version(db)
+        except ValueError as error:
+            yield Finding("database", False, f"{path} is of a newer onedemo ({error}): update onedemo")
+            return
+        said = [line for (line,) in db.execute("PRAGMA integrity_check(5)")]
+        if said != ["ok"]:
+            yield Finding("database", False, f"{path} is damaged ({'; '.join(said)}): restore a backup")
+            return
+        lost = db.execute("PRAGMA foreign_key_check").fetchall()
+        if lost:
+            tables = ", ".join(sorted({row[0] for row in lost}))
+            yield Finding(
+                "database", False, f"{len(lost)} rows of {tables} belong to nothing: restore a backup"
+            )
+            return
+        (ratings,) = db.execute("SELECT COUNT(*) FROM ratings").fetchone()
+    schema = f"schema {version}"
+    if version < len(STEPS):
+        schema += f", which is brought to {len(STEPS)} when onedemo opens it"
+    yield Finding("database", True, f"whole; {_count(ratings, 'rating')}; {schema}")
+
+
+def _files(data_dir: Path) -> Iterator[Finding]:
+    """What the database names and the disk lacks, and the other way round; what is damaged."""
+    with closing(_open(data_dir / FILE_NAME)) as db:
+        runs = [run for (run,) in db.execute("SELECT id FROM runs")]
+        snapshots = db.execute("SELECT run, number FROM snapshots").fetchall()
+        waiting = db.execute(
+            "SELECT run, id FROM clips WHERE state = 'ready' AND id NOT IN (SELECT clip_id FROM events)"
+        ).fetchall()
+    root = data_dir / "runs"
+    named = {snapshot_file(root / run, number) for run, number in snapshots}
+    there = set(root.glob("*/snapshots/*.pt"))
+    clips = {root / run / "clips" / f"{clip:06d}.jpg" for run, clip in waiting}
+    pictures = set(root.glob("*/clips/*.jpg"))
+    kept = [*there, *root.glob("*/checkpoint.pt"), *root.glob("*/rollouts/*.npz")]
+    orphans = [path for path in root.glob("*") if path.is_dir() and path.name not in runs]
+    half = [path for path in data_dir.rglob(".*") if path.is_file()]
+    faults = [
+        ("lacks", named - there, "a predictor; the newest there is used, and the next fit makes another"),
+        ("lacks", clips - pictures, "the picture of a clip; it is drawn again when onedemo starts"),
+        ("holds a damaged", _broken(kept, _zip_fault), "restore a backup, or delete it"),
+        ("holds a damaged", _broken(clips & pictures, _jpeg_fault), "delete it, it is drawn again"),
+        ("set aside", set(data_dir.rglob("*.damaged")), "it was damaged and has been made anew: delete it"),
+        ("does not know", set(orphans), "a directory of no run: delete it if nothing in it is wanted"),
+        ("does not know", there - named, "a predictor that came too late: delete it if no server runs"),
+        ("left half written", set(half), "delete it if no server runs"),
+    ]  # fmt: skip
+    well = True
+    for verb, paths, advice in faults:
+        if paths:
+            well = False
+            yield Finding("files", False, f"{data_dir} {verb} {_name(sorted(paths))}: {advice}")
+    if well:
+        total = len(named) + len(clips)
+        yield Finding("files", True, f"{_count(len(runs), 'run')}, {_count(total, 'file')} where they belong")
+
+
+def _demos(data_dir: Path) -> Iterator[Finding]:
+    there = [path.parent for path in (data_dir / "demos").glob("*/demo.json")]
+    known = {demo.path.parent: demo for demo in list_demos(data_dir / "demos")}
+    broken = [path for path in there if path not in known or _sha256(known[path].path) != known[path].sha256]
+    if broken:
+        yield Finding("demonstrations", False, f"{_name(broken)} damaged: delete it and add the video again")
+    else:
+        yield Finding("demonstrations", True, f"{_count(len(there), 'video')} of your own, as brought in")
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
+
+
+def _zip_fault(path: Path) -> bool:
+    """Whether a file of arrays or weights is damaged: both kinds are ZIP archives with checksums."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is not None
+    except FileNotFoundError:  # replaced meanwhile
+        return False
+    except (OSError, zipfile.BadZipFile, EOFError, ValueError, NotImplementedError):
+        return True
+
+
+def _broken(paths: Iterable[Path], fault: Callable[[Path], bool]) -> set[Path]:
+    return {path for path in paths if fault(path)}
+
+
+def _jpeg_fault(path: Path) -> bool:
+    """Whether a picture is cut off or empty."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return False
+    return not (data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9"))
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _name(paths: list[Path]) -> str:
+    first = ", ".join(str(path) for path in paths[:_NAMED])
+    return first if len(paths) <= _NAMED else f"{first} and {len(paths) - _NAMED} more"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
