@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -55,27 +54,23 @@ class Comparison:
         gui: The client's.
         key: Which figure of an iteration.
         title: Of the chart.
-        runs: Names of all that may be drawn.
         dark: Whether the page is dark.
     """
 
-    def __init__(self, gui: Any, key: str, title: str, *, runs: Sequence[str], dark: bool) -> None:
-        self._key, self._runs, self._limited = key, list(runs), key == "predicted"
-        nothing = np.array([0.0])
-        series = [
-            _line(run, colour, points=False)
-            for run, colour in zip(self._runs, itertools.cycle(_DARK_SERIES if dark else _SERIES))
-        ]
+    def __init__(self, gui: Any, key: str, title: str, *, dark: bool) -> None:
+        self._key, self._limited = key, key == "predicted"
+        self._colours = _DARK_SERIES if dark else _SERIES
         self._handle = gui.add_uplot(
-            data=(nothing, *[np.array([np.nan]) for _ in runs]),
-            series=({"label": "control steps"}, *series),
+            data=(np.array([0.0]), np.array([np.nan])),
+            series=self._series([""]),
             legend={"show": True},
             **_plot(title, dark, (1.0, 5.0) if self._limited else None),
         )
 
     def draw(self, rows_of: Mapping[str, Sequence[dict]]) -> None:
-        """Draws the curves of some runs, by name; the others are empty."""
-        x, *curves = compared(rows_of, self._runs, self._key)
+        """Draws the curves of some runs, by name."""
+        runs = list(rows_of) or [""]
+        x, *curves = compared(rows_of, runs, self._key)
         if not self._limited:  # uPlot finds no limits where a whole curve is missing
             known = np.concatenate(curves)
             known = known[np.isfinite(known)]
@@ -84,7 +79,17 @@ class Comparison:
             self._handle.scales = {
                 "x": {"time": False}, "y": {"range": [float(low - margin), float(high + margin)]},
             }  # fmt: skip
+        self._handle.series = self._series(runs)
         self._handle.data = (x, *curves)
+
+    def _series(self, runs: Sequence[str]) -> tuple[dict[str, Any], ...]:
+        lines = (
+            _line(run, self._colours[k % len(self._colours)], points=False)
+            # The second time round a colour is dashed.
+            | ({"dash": [6, 4]} if k >= len(self._colours) else {})
+            for k, run in enumerate(runs)
+        )
+        return {"label": "control steps"}, *lines
 
 
 class _Curve:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from app.pair_desk import PairDesk
 from app.player import player_html
 from app.pressing import Pressing
-from app.rate_html import KEYS_DIALOG, tools_html
+from app.rate_html import tools_html
+from app.words import COMPARE_KEYS, keys_dialog
 from trainer.records import Status
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Compare(Pressing):
         gui = session.client.gui
         self._top, self._stage = gui.add_html(""), gui.add_html("")
         self._answers, self._tools = gui.add_html(""), gui.add_html("")
-        gui.add_html(KEYS_DIALOG)
+        gui.add_html(keys_dialog(COMPARE_KEYS))
 
     def show(self) -> None:
         """Draws the tab and lets its keys act."""

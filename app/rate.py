@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from app import rate_html as html
 from app.desk import Desk
 from app.pressing import Pressing
-from app.words import ANSWERS
+from app.words import ANSWERS, RATE_KEYS, keys_dialog
 from trainer.records import Status
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Rate(Pressing):
             gui.add_html(html.SUBMIT)
         self._tools = gui.add_html("")
         self._why, self._ahead = gui.add_html(""), gui.add_html("")
-        gui.add_html(html.KEYS_DIALOG)
+        gui.add_html(keys_dialog(RATE_KEYS))
 
     def show(self) -> None:
         """Draws the tab and lets its keys act."""

@@ -6,18 +6,13 @@ from html import escape
 
 from app.lesson import Lesson
 from app.player import example_address, player_html
-from app.words import ANSWERS, REASONS, keys_html
+from app.words import ANSWERS, REASONS
 from trainer.records import Demo, Status
 
 SUBMIT = (
     '<div class="od-submit">'
     '<button type="button" class="od-button od-primary" data-submit>Submit</button></div>'
 )
-KEYS_DIALOG = (
-    '<dialog class="od-help" aria-label="Keys"><h2>Keys</h2>'
-    f'{keys_html()}<form method="dialog"><button class="od-button od-primary">Close</button></form></dialog>'
-)
-
 _QUESTION = "How alike are the two movements?"
 
 

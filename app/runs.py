@@ -15,8 +15,10 @@ from trainer.records import Status
 if TYPE_CHECKING:
     from app.session import Session
 
-_COMPARED = 6
-"""Runs whose curves are drawn at most."""
+_NEWEST = 6
+"""Runs that are compared before anybody says which."""
+_COMPARED = 12
+"""Runs whose curves are drawn at most: more lines cannot be told apart."""
 
 
 class Runs:
@@ -33,22 +35,19 @@ class Runs:
         self._told = ""
         gui = session.client.gui
         self._table = gui.add_html("")
-        self._chosen = {
-            run: gui.add_checkbox(run, initial_value=True)
-            for run in [entry["id"] for entry in self._store.runs()][-_COMPARED:]
-        }
-        for box in self._chosen.values():
-            box.on_update(lambda _: self._draw_curves())
-        gui.add_html('<div class="od-break"></div>')
+        self._wanted = gui.add_text("Compare", "", hint="Names or parts of names, with commas between")
+        self._wanted.on_update(lambda _: self.refresh(self._trainer.status()))
+        self._told_which = gui.add_html("")
+        self._client, self._drawn = session.client, []
         self._curves = [
-            charts.Comparison(gui, key, title, dark=session.dark, runs=list(self._chosen))
+            charts.Comparison(gui, key, title, dark=session.dark)
             for key, title in (
                 ("predicted", "Predicted rating (1 to 5) by control steps"),
                 ("true_reward", "True reward of an episode by control steps (never trained on)"),
             )
         ]
-        demos_dir = page.trainer.data_dir / "demos"
-        gui.add_html(new_run_html([demo.name for demo in list_demos(demos_dir)], list(self._chosen)))
+        demos = [demo.name for demo in list_demos(page.trainer.data_dir / "demos")]
+        gui.add_html(new_run_html(demos, [entry["id"] for entry in self._store.runs()]))
 
     def show(self) -> None:
         """Lists the runs."""
@@ -65,31 +64,31 @@ class Runs:
         with self._lock:
             if not self._shown:
                 return
-            grown = False
-            for run in self._chosen:
+            runs = self._store.runs()
+            drawn, more = chosen_runs([run["id"] for run in runs], self._wanted.value, self._run)
+            grown = drawn != self._drawn
+            for run in drawn:
                 rows = self._rows.setdefault(run, [])
                 if run == self._run or not rows:
                     new = self._store.iterations(run, after=rows[-1]["number"] if rows else 0)
                     rows += new
                     grown |= bool(new)
-            told = runs_html(self._store.runs(), self._figures(), self._run, status)
-            if told != self._told:
-                self._told = self._table.content = told
-            if grown:
-                self._draw_curves()
+            told = runs_html(runs, self._figures(runs), self._run, status, drawn)
+            with self._client.atomic():
+                if told != self._told:
+                    self._told = self._table.content = told
+                if grown or not self._told_which.content:
+                    self._drawn = drawn
+                    self._told_which.content = which_html(drawn, more)
+                    for curve in self._curves:
+                        curve.draw({run: self._rows[run] for run in drawn})
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""
 
-    def _draw_curves(self) -> None:
-        with self._lock:
-            shown = {run: rows for run, rows in self._rows.items() if self._chosen[run].value}
-            for curve in self._curves:
-                curve.draw(shown)
-
-    def _figures(self) -> dict[str, dict[str, Any]]:
+    def _figures(self, runs: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
         figures = {}
-        for run in self._store.runs():
+        for run in runs:
             name = run["id"]
             rows = self._rows.get(name)
             last = rows[-1] if rows else (self._store.last_iteration(name) or {})
@@ -97,9 +96,48 @@ class Runs:
         return figures
 
 
+def chosen_runs(runs: Sequence[str], wanted: str, current: str) -> tuple[list[str], int]:
+    """Which runs are compared.
+
+    Args:
+        runs: All, oldest first.
+        wanted: Names or parts of names, with commas between; a whole name means that run alone. Nothing: the
+            newest, and the one at hand.
+        current: The one at hand.
+
+    Returns:
+        Their names, the newest first, at most so many as can be told apart; and how many more were wanted.
+    """
+    newest = list(reversed(runs))
+    parts = [part.strip().lower() for part in wanted.split(",") if part.strip()]
+    if not parts:
+        others = [run for run in newest if run != current]
+        kept = {current, *others[: _NEWEST - 1]}
+        return [run for run in newest if run in kept], 0
+    whole = {run.lower() for run in runs}
+    found = [
+        run
+        for run in newest
+        if any(part == run.lower() or (part not in whole and part in run.lower()) for part in parts)
+    ]
+    return found[:_COMPARED], max(0, len(found) - _COMPARED)
+
+
+def which_html(drawn: Sequence[str], more: int) -> str:
+    """What the curves show, in words."""
+    if not drawn:
+        told = "No run has such a name."
+    elif more:
+        told = f"The newest {len(drawn)} of {len(drawn) + more} such runs are drawn."
+    else:
+        told = f"{len(drawn)} run{'' if len(drawn) == 1 else 's'} drawn."
+    return f'<p class="od-which od-quiet" role="status">{told}</p>'
+
+
 def runs_html(
-    runs: Sequence[Mapping[str, Any]], figures: Mapping[str, Mapping[str, Any]], current: str, status: Status
-) -> str:
+    runs: Sequence[Mapping[str, Any]], figures: Mapping[str, Mapping[str, Any]], current: str,
+    status: Status, drawn: Sequence[str],
+) -> str:  # fmt: skip
     """The table of runs, the newest first.
 
     Args:
@@ -107,10 +145,11 @@ def runs_html(
         figures: Of each: ``ratings``, and the newest iteration's.
         current: The one that is served.
         status: Of that one.
+        drawn: Those whose curves are drawn.
     """
     heads = (
         "Run", "Demonstration", "Method", "Seed", "Ratings", "Iterations", "Control steps",
-        "Predicted rating", "True reward", "",
+        "Predicted rating", "True reward", "Compare", "",
     )  # fmt: skip
     rows = ""
     for run in reversed(runs):
@@ -124,7 +163,11 @@ def runs_html(
             escape(run["demo"]), escape(method_of(run["config"])), run["seed"], row["ratings"],
             f"{row['number']:,}" if "number" in row else "–",
             charts.short(row["env_steps"]) if "env_steps" in row else "–",
-            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), ""), action,
+            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), ""),
+            f'<button type="button" class="od-button od-small" data-compare="{escape(name)}" '
+            f'aria-pressed="{str(name in drawn).lower()}" aria-label="Compare {escape(name)}">'
+            f"{'✓' if name in drawn else '+'}</button>",
+            action,
         )  # fmt: skip
         made = f"made {run['created_at'][:16].replace('T', ' ')} UTC"
         rows += (
@@ -139,7 +182,7 @@ def runs_html(
         "is lost.</p></div></div>"
         '<section><div class="od-scroll" tabindex="0" role="region" aria-label="Runs">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
-        "<h2>Compare</h2></article>"
+        "<h2>Compare</h2><p class=od-quiet>Press + beside a run, or write a part of its name.</p></article>"
     )
 
 

@@ -163,13 +163,24 @@ document.addEventListener("click", (event) => {
       button.disabled = false;
       button.textContent = error.message;
     });
-  } else if ("reason" in data) sayWhy(button.closest(".od-why"), data.reason);
+  } else if (data.compare) compare(data.compare);
+  else if ("reason" in data) sayWhy(button.closest(".od-why"), data.reason);
   else if ("submit" in data) {
     // What is on screen is what is rated: slider messages are throttled and may come too late.
     const thumb = shown(".mantine-Slider-thumb");
     if (thumb) press(thumb.getAttribute("aria-valuenow"));
   }
 });
+
+// A run on or off the charts: what is written in the field says which are there.
+function compare(run) {
+  const field = shown("div:has(> .od-runs) ~ div input");
+  const on = [...document.querySelectorAll('[data-compare][aria-pressed="true"]')].map((b) => b.dataset.compare);
+  const runs = on.includes(run) ? on.filter((name) => name !== run) : [...on, run];
+  // React sees a change only through the element's own setter.
+  Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, runs.join(", "));
+  field.dispatchEvent(new Event("input", { bubbles: true }));
+}
 
 // A reason of one's own, by Enter.
 document.addEventListener("keydown", (event) => {

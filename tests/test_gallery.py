@@ -1,12 +1,14 @@
 """What is kept of an iteration, and what is drawn of it when somebody asks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_choice import rollouts as empty_rollouts
 from worlds import falling_demo, falling_states
 
 from app.progress import chosen, gallery_html, timeline_html
-from trainer.gallery import PARTS, Gallery, summarise
+from trainer.gallery import PARTS, Episode, Gallery
 from trainer.render import RenderThread
 from trainer.video import VideoReader, count_frames
 
@@ -18,13 +20,41 @@ class ByLane:
         return 1.0 + np.arange(len(frames))[:, None] - (frames >= 120)
 
 
-def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there():
+def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there(tmp_path):
     clock = np.tile(np.arange(200, 700), (3, 1)).astype(np.int32)
-    parts, best, mean = summarise(ByLane(), empty_rollouts(clock), lambda steps: steps * 240 // 1000, 1000)
-    assert len(parts) == PARTS and best == 2
+    gallery = Gallery(tmp_path, None, 0.008, None)
+    told = gallery.note(1, ByLane(), empty_rollouts(clock), lambda steps: steps * 240 // 1000, 1000)
+    parts = told["timeline"]
+    assert len(parts) == PARTS and "best" not in told  # no episode ended
     assert [k for k, part in enumerate(parts) if part is not None] == list(range(8, 28))
     assert parts[8:20] == [2.0] * 12 and parts[20:28] == [1.0] * 8
-    assert mean == pytest.approx(3 - 200 / 500)
+
+
+def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_quarter_of_one(tmp_path):
+    """Two lanes, episodes of 1000 steps in iterations of 250; the second lane is 100 steps behind."""
+    clocks = (np.arange(2000)[None] - np.array([[0], [100]])) % 1000
+    gallery = Gallery(tmp_path, None, 0.008, None)
+    kept = []
+    for k in range(8):
+        part = empty_rollouts(np.arange(250)[None] * np.ones((2, 1)))
+        clock = clocks[:, 250 * k : 250 * (k + 1)].astype(np.int32)
+        qpos = np.repeat(clock[..., None], 6, axis=2).astype(float)
+        part = replace(part, clock=clock, qpos=qpos, truncated=clock == 999)
+        told = gallery.note(k + 1, ByLane(), part, lambda steps: steps * 240 // 1000, 1000)
+        kept.append(told.get("best"))
+    # The episodes under way when it began to look are not whole; nor is the second lane's of 100 steps.
+    assert [k for k, best in enumerate(kept) if best is not None] == [4, 7]
+    assert kept[4] == pytest.approx(1.5, abs=0.01) and kept[7] == pytest.approx(0.5, abs=0.01)
+    for iteration in (5, 8):
+        with np.load(tmp_path / f"{iteration:06d}.npz") as data:
+            assert data["qpos"][:, 0].tolist() == list(range(1000))
+            assert data["frames"].tolist() == [t * 240 // 1000 for t in range(1000)]
+
+
+def test_a_long_attempt_is_better_than_a_good_moment():
+    short = Episode(np.zeros((10, 6)), np.arange(10), np.full(2, 4.0))
+    long = Episode(np.zeros((1000, 6)), np.arange(1000), np.full(200, 3.0))
+    assert long.worth > short.worth
 
 
 @pytest.mark.seam

@@ -127,9 +127,42 @@ def test_runs_side_by_side(chromium, site, viewport):
         assert row.locator("td").all_inner_texts()[:6] == ["hopper-hop", "paper", "4", "0", "5", "80 k"]
         assert page.locator(".od-current th").inner_text() == site.trainer.run
         until(lambda: page.locator(".uplot").count() == 2)
+        assert page.locator('[data-compare][aria-pressed="true"]').count() == 2
         page.fill('.od-new-run [name="name"]', "another")
         page.click(".od-new-run button")
         page.wait_for_selector(".od-form-note >> text=there is this run alone")
+
+
+@BOTH
+def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site, viewport):
+    store = site.trainer.store
+    for seed in range(50):
+        name = f"hop-{seed}"
+        store.add_run(
+            run=name, demo="hopper-hop", demo_sha256="0", seed=seed, config='method = "paper"\n', version="0"
+        )
+        store.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
+    with opened(chromium, site.links["researcher"], viewport) as page:
+        to_tab(page, "Runs")
+        page.wait_for_selector(".od-which >> text=6 runs drawn.")
+
+        def legend():
+            return page.locator(".uplot").first.locator(".u-legend .u-label").all_inner_texts()[1:]
+
+        newest = [f"hop-{k}" for k in range(49, 44, -1)]
+        until(lambda: legend() == [*newest, site.trainer.run])
+        page.locator('[data-compare="hop-0"]').click()
+        until(lambda: legend() == [*newest, "hop-0", site.trainer.run])
+        page.locator('[data-compare="hop-47"]').click()
+        until(lambda: "hop-47" not in legend())
+        page.fill("div:has(> .od-runs) + div input", "hop-1, BACK")  # a whole name is not a part of others
+        until(lambda: legend() == ["hop-1", site.trainer.run])
+        page.fill("div:has(> .od-runs) + div input", "hop")
+        page.wait_for_selector(".od-which >> text=The newest 12 of 50 such runs are drawn.")
+        assert site.events() == []
+        page.select_option('.od-new-run [name="predictor_from"]', "hop-0")
+        table = page.locator(".od-runs .od-scroll").bounding_box()
+        assert table["height"] < 600
 
 
 @BOTH
@@ -155,9 +188,11 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site, viewport):
             expected.append((shown(), answer))
             act()
             until(lambda: answers() == expected)
+            page.wait_for_selector(f'[data-pair="{expected[-1][0]}"]', state="detached")
         shown()
         page.keyboard.press("u")
         until(lambda: answers() == expected[:-1])
+        page.wait_for_selector(f'[data-pair="{expected[-1][0]}"]')
         assert shown() == expected[-1][0]
         page.keyboard.press("s")
         until(lambda: page.locator(f'[data-pair="{expected[-1][0]}"]').count() == 0)
@@ -165,3 +200,6 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site, viewport):
         assert "pairs" in site.trainer.calls and site.events() == []
         bottom = page.locator(".od-tools").bounding_box()
         assert bottom["y"] + bottom["height"] <= viewport["height"]
+        page.keyboard.press("?")
+        help = page.locator(".od-help:visible")
+        assert "the left one is nearer" in help.inner_text() and "mark" not in help.inner_text()

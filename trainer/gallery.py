@@ -1,8 +1,10 @@
 """What each iteration looked like: how parts of the demo are rated, and the best rollout to be seen again.
 
-Only positions are kept (a few KB an iteration); pictures and videos are drawn when somebody asks.
+An episode lasts longer than an iteration, so lanes are followed from one to the next. Only positions are
+kept (some KB an iteration); pictures and videos are drawn when somebody asks.
 
-Shapes: N lanes, T control steps, k frames, q = 6 positions.
+Shapes: N lanes, T control steps of an iteration, S of them that are rated, L steps of an episode,
+q = 6 positions.
 """
 
 from __future__ import annotations
@@ -10,8 +12,9 @@ from __future__ import annotations
 import io
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,40 +34,72 @@ _EVERY = 5
 _SHOWN = 6
 _WIDTH, _HEIGHT = 160, 120
 _QUALITY = 82
+_AT_ONCE = 30
+"""Pictures in memory while a video is drawn: each is half a megabyte."""
 
 
-def summarise(
-    snapshot: Snapshot, rollouts: Rollouts, frames_of: Callable[[np.ndarray], np.ndarray], demo_steps: int
-) -> tuple[list[float | None], int, float]:
-    """Of one iteration: where in the demo it is rated how, and which lane did best.
+def by_part(clock: np.ndarray, ratings: np.ndarray, demo_steps: int) -> list[float | None]:
+    """Where in the demo it is rated how.
 
     Args:
-        snapshot: Rates.
-        rollouts: What was done, (N, T).
-        frames_of: Demo frame at control steps.
+        clock: Demo steps, (N, S).
+        ratings: Predicted there, (N, S).
         demo_steps: Control steps of the demo.
 
     Returns:
-        Mean predicted rating in each of ``PARTS`` parts of the demo (None where nobody was), the lane with
-        the highest mean, and that mean.
+        The mean in each of ``PARTS`` parts of the demo; None where nobody was.
     """
-    some = (slice(None), slice(None, None, _EVERY))
-    clock = rollouts.clock[some]
-    ratings = snapshot.ratings(frames_of(clock), rollouts.obs[some], rollouts.actions[some])
     part = np.minimum(clock * PARTS // demo_steps, PARTS - 1).ravel()
     counts = np.bincount(part, minlength=PARTS)
     sums = np.bincount(part, weights=ratings.ravel(), minlength=PARTS)
-    means = [round(float(s / n), 3) if n else None for s, n in zip(sums, counts, strict=True)]
-    of_lanes = ratings.mean(axis=1)
-    best = int(of_lanes.argmax())
-    return means, best, float(of_lanes[best])
+    return [round(float(s / n), 3) if n else None for s, n in zip(sums, counts, strict=True)]
 
 
-def longest(ended: np.ndarray) -> slice:
-    """The longest stretch of steps within one episode, where some steps end one: (T,) bool."""
-    edges = [0, *(np.flatnonzero(ended) + 1).tolist(), len(ended)]
-    start, stop = max(itertools.pairwise(edges), key=lambda edge: edge[1] - edge[0])
-    return slice(start, stop)
+class Episode(NamedTuple):
+    """A whole episode of one lane."""
+
+    qpos: np.ndarray
+    """(L, q), float32."""
+    clock: np.ndarray
+    """Demo step at each, (L,)."""
+    ratings: np.ndarray
+    """Predicted, at every fifth step or so."""
+
+    @property
+    def worth(self) -> float:
+        """What it is compared by: long and good is better than good and soon over."""
+        return float((self.ratings - 1).sum())
+
+
+class Lanes:
+    """Follows lanes from iteration to iteration and puts their episodes together."""
+
+    def __init__(self) -> None:
+        self._open: dict[int, list[Episode]] = {}
+
+    def ended(self, rollouts: Rollouts, ratings: np.ndarray) -> list[Episode]:
+        """The episodes that ended in an iteration and whose beginning was seen.
+
+        Args:
+            rollouts: The iteration, (N, T).
+            ratings: Predicted at every ``_EVERY``-th of its steps, (N, S).
+        """
+        whole = []
+        for lane, ends in enumerate(rollouts.terminated | rollouts.truncated):
+            edges = [0, *(np.flatnonzero(ends) + 1).tolist(), len(ends)]
+            for start, stop in itertools.pairwise(edges):
+                if start > 0:
+                    self._open[lane] = []
+                if lane not in self._open:
+                    continue  # it had begun before anybody looked
+                rated = slice(-(-start // _EVERY), -(-stop // _EVERY))
+                qpos = rollouts.qpos[lane, start:stop].astype(np.float32)
+                parts = self._open[lane]
+                parts.append(Episode(qpos, rollouts.clock[lane, start:stop].copy(), ratings[lane, rated]))
+                if stop > 0 and ends[stop - 1]:
+                    whole.append(Episode(*map(np.concatenate, zip(*parts, strict=True))))
+                    parts.clear()
+        return [episode for episode in whole if len(episode.ratings)]
 
 
 class Gallery:
@@ -79,9 +114,36 @@ class Gallery:
 
     def __init__(self, directory: Path, demo: Demo, dt: float, renderer: RenderThread) -> None:
         self._directory, self._demo, self._dt, self._renderer = directory, demo, dt, renderer
+        self._lanes = Lanes()
+
+    def note(
+        self, iteration: int, snapshot: Snapshot, rollouts: Rollouts,
+        frames_of: Callable[[np.ndarray], np.ndarray], demo_steps: int,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Looks at what was done in an iteration, and keeps the best whole episode that ended in it.
+
+        Args:
+            iteration: Its number.
+            snapshot: Rates.
+            rollouts: What was done, (N, T).
+            frames_of: Demo frame at control steps.
+            demo_steps: Control steps of the demo.
+
+        Returns:
+            "timeline" as ``by_part``; and "best", the episode's mean predicted rating, if one ended.
+        """
+        some = (slice(None), slice(None, None, _EVERY))
+        clock = rollouts.clock[some]
+        ratings = snapshot.ratings(frames_of(clock), rollouts.obs[some], rollouts.actions[some])
+        told: dict[str, Any] = {"timeline": by_part(clock, ratings, demo_steps)}
+        if whole := self._lanes.ended(rollouts, ratings):
+            best = max(whole, key=lambda episode: episode.worth)
+            self.keep(iteration, best.qpos, frames_of(best.clock))
+            told["best"] = float(best.ratings.mean())
+        return told
 
     def keep(self, iteration: int, qpos: np.ndarray, frames: np.ndarray) -> None:
-        """Keeps the best rollout of an iteration: positions (T, q), and the demo frame beside each (T,)."""
+        """Keeps the best rollout of an iteration: positions (L, q), and the demo frame beside each (L,)."""
         buffer = io.BytesIO()
         np.savez_compressed(buffer, qpos=qpos.astype(np.float32), frames=frames.astype(np.int32))
         write_atomic(self._file(iteration, "npz"), buffer.getvalue())
@@ -102,9 +164,11 @@ class Gallery:
         if suffix == "jpg":
             write_atomic(file, self._renderer.submit(lambda renderer: filmstrip(renderer, qpos)).result())
         else:
-            beside = read_frames(self._demo)[frames]
+            demo = read_frames(self._demo)
             self._renderer.submit(
-                lambda renderer: write_video(file, renderer, qpos, beside, dt=self._dt, fps=self._demo.fps)
+                lambda renderer: write_video(
+                    file, renderer, qpos, demo, frames, dt=self._dt, fps=self._demo.fps
+                )
             ).result()
         return file
 
@@ -132,25 +196,31 @@ def filmstrip(renderer: Renderer, qpos: np.ndarray) -> bytes:
 
 
 def write_video(
-    file: Path, renderer: Renderer, qpos: np.ndarray, demo_frames: np.ndarray, *, dt: float, fps: float
-) -> None:
+    file: Path, renderer: Renderer, qpos: np.ndarray, demo: np.ndarray, frames: np.ndarray, *, dt: float,
+    fps: float,
+) -> None:  # fmt: skip
     """A rollout beside the demo, in real time, as WebM.
 
     Args:
         file: Where to.
         renderer: Draws.
-        qpos: Positions, (T, q).
-        demo_frames: The demo's frame beside each of them, (T, H, W, 3), uint8.
+        qpos: Positions, (L, q).
+        demo: The demo's frames, (F, H, W, 3), uint8.
+        frames: Which of them is beside each position, (L,).
         dt: Seconds of a control step.
         fps: Frames per second of the video.
     """
     shown = np.round(np.arange(0, len(qpos) * dt * fps) / fps / dt).astype(int)
     shown = shown[shown < len(qpos)]
-    robot = renderer.render(qpos[shown])
+
+    def pairs() -> Iterator[np.ndarray]:
+        for some in np.array_split(shown, -(-len(shown) // _AT_ONCE)):
+            for t, robot in zip(some, renderer.render(qpos[some]), strict=True):
+                yield side_by_side(demo[frames[t]], robot)
+
     half = file.with_name(f".half-{os.getpid()}-{file.name}")
     try:
-        pairs = (side_by_side(demo_frames[t], picture) for t, picture in zip(shown, robot, strict=True))
-        write_webm(half, pairs, fps=fps)
+        write_webm(half, pairs(), fps=fps)
         half.replace(file)
     finally:
         half.unlink(missing_ok=True)

@@ -324,12 +324,9 @@ class Trainer:
         rollouts, stats = learner.iterate(snapshot)
         stats |= self._true_reward(rollouts)
         if self._gallery is not None:
-            parts, lane, best = gallery.summarise(snapshot, rollouts, learner.frames_of, learner.demo_steps)
-            whole = gallery.longest(rollouts.terminated[lane] | rollouts.truncated[lane])
-            self._gallery.keep(
-                learner.iteration, rollouts.qpos[lane, whole], learner.frames_of(rollouts.clock[lane, whole])
+            stats |= self._gallery.note(
+                learner.iteration, snapshot, rollouts, learner.frames_of, learner.demo_steps
             )
-            stats |= {"timeline": parts, "best": best}
         self._work_s = time.monotonic() - began
         stats["steps_per_s"] = (learner.env_steps - before) / self._work_s
         self._pool, self._policy = rollouts, learner.policy()
