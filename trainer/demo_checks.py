@@ -19,6 +19,8 @@ from trainer.errors import UserError
 from trainer.video import VideoReader
 
 MAX_SECONDS = 60.0
+MAX_FRAMES = 200_000
+"""Of the video that comes in, also of the part that is not used: nearly two hours at 30 a second."""
 MIN_SIDE, MAX_SIDE = 16, 4096
 """Pixels, of the video that comes in."""
 
@@ -43,6 +45,8 @@ class SourceWatch:
         """The reader's frames; raises UserError once they prove too long."""
         for seconds, frame in self._reader.frames(self._start):
             self._seen += 1
+            if self._seen > MAX_FRAMES:
+                raise UserError(f"{self._path} has more than {MAX_FRAMES} frames; cut out the part to use")
             self._seconds = seconds + 1 / self._reader.info.fps
             stop = self._seconds if self._end is None else min(self._seconds, self._end)
             self._used += seconds >= self._start and (self._end is None or seconds < self._end)
@@ -53,6 +57,11 @@ class SourceWatch:
     def check_whole(self, count: int) -> None:
         """Raises UserError if the source broke off or too little of it is left."""
         info = self._reader.info
+        if not self._seen:
+            raise UserError(
+                f"{self._path} cannot be decoded: it is damaged, or needs more memory than a video may; "
+                "convert it to a plain mp4 and try again"
+            )
         reached_end = self._end is None or self._seconds < self._end
         # Both must fall short: the frame count of some containers is only length times rate.
         if reached_end and self._seen < 0.9 * info.frames and self._seconds < 0.9 * info.seconds:

@@ -17,22 +17,21 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from trainer.demo_checks import SourceWatch, check_length, check_name, check_options, check_size
+from trainer.demo_checks import check_name, check_options
 from trainer.errors import UserError
 from trainer.files import write_atomic
+from trainer.guarded import Limits, Options, decode
 from trainer.records import Demo
 from trainer.timing import steps_of_frames
-from trainer.video import VideoReader, resample, write_webm
+from trainer.video import VideoReader, write_webm
 
 BUILT_IN = Path(__file__).resolve().parent.parent / "static" / "demos"
-STORED_SIDE = 640
-"""Pixels, of the longer side of what is stored: more than a clip ever shows."""
 
 _log = logging.getLogger(__name__)
 
@@ -49,6 +48,7 @@ def import_video(
     fps: float = 30.0,
     task: str = "",
     source: str = "",
+    limits: Limits | None = None,
 ) -> Demo:
     """Brings a video in as a demo: trimmed, cropped, at a fixed rate, at most 640 px long.
 
@@ -65,6 +65,7 @@ def import_video(
         fps: Frame rate to bring it to, 1..120.
         task: The hand-coded reward that describes the move, if known.
         source: Where the video is from; its file name if empty.
+        limits: What decoding it may take; the defaults if None.
 
     Returns:
         The demo, stored.
@@ -75,66 +76,57 @@ def import_video(
     path, demos_dir = Path(path), Path(demos_dir)
     check_name(name)
     check_options(start=start, end=end, crop=crop, fps=fps)
-    with VideoReader(path) as reader:
-        check_size(path, reader.info.width, reader.info.height, crop)
-        check_length(path, reader.info.seconds, start=start or 0.0, end=end)
-        origin = {
-            "source_sha256": _sha256(path),
-            "options": {
-                "start": start,
-                "end": end,
-                "crop": list(crop) if crop else None,
-                "mirror": mirror,
-                "fps": fps,
-            },
-        }
-        stored = list(_load_all(demos_dir))
-        for demo, about in stored:
-            if {key: about.get(key) for key in origin} == origin:
+    if not path.is_file():
+        raise UserError(f"there is no video file at {path}")
+    options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)
+    origin = {
+        "source_sha256": _sha256(path),
+        "options": {
+            "start": start,
+            "end": end,
+            "crop": list(crop) if crop else None,
+            "mirror": mirror,
+            "fps": fps,
+        },
+    }
+    stored = list(_load_all(demos_dir))
+    for demo, about in stored:
+        if {key: about.get(key) for key in origin} == origin:
+            return demo
+    if name in {demo.name for demo, _ in stored}:
+        raise UserError(f"the name {name} is taken by another demo; choose another --name")
+    try:
+        demos_dir.mkdir(parents=True, exist_ok=True)
+        workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+    except OSError as error:
+        raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
+    workshop.chmod(0o755)  # made for this user alone, but others may read demos
+    try:
+        video = workshop / "video.webm"
+        with closing(decode(path, options, limits)) as frames:
+            count = write_webm(video, frames, fps=fps)
+        sha256 = _sha256(video)
+        about = _describe(
+            workshop / "demo.json",
+            video,
+            name=name,
+            sha256=sha256,
+            fps=fps,
+            frames=count,
+            task=task,
+            source=source or path.name,
+            **origin,
+        )
+        final = demos_dir / sha256
+        for demo, _ in stored:
+            if demo.sha256 == sha256:  # other options that give the same pictures
+                shutil.rmtree(workshop)
                 return demo
-        if name in {demo.name for demo, _ in stored}:
-            raise UserError(f"the name {name} is taken by another demo; choose another --name")
-        try:
-            demos_dir.mkdir(parents=True, exist_ok=True)
-            workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
-        except OSError as error:
-            raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
-        workshop.chmod(0o755)  # made for this user alone, but others may read demos
-        try:
-            video = workshop / "video.webm"
-            watch = SourceWatch(path, reader, start=start or 0.0, end=end)
-            frames = resample(
-                watch.frames(),
-                fps=fps,
-                period=1 / reader.info.fps,
-                start=start or 0.0,
-                end=math.inf if end is None else end,
-            )
-            shaped = (_shape(frame, crop=crop, mirror=mirror) for frame in frames)
-            count = write_webm(video, shaped, fps=fps)
-            watch.check_whole(count)
-            sha256 = _sha256(video)
-            about = _describe(
-                workshop / "demo.json",
-                video,
-                name=name,
-                sha256=sha256,
-                fps=fps,
-                frames=count,
-                task=task,
-                source=source or path.name,
-                **origin,
-            )
-            final = demos_dir / sha256
-            for demo, _ in stored:
-                if demo.sha256 == sha256:  # other options that give the same pictures
-                    shutil.rmtree(workshop)
-                    return demo
-            shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
-            os.replace(workshop, final)
-        except BaseException:
-            shutil.rmtree(workshop, ignore_errors=True)
-            raise
+        shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
+        os.replace(workshop, final)
+    except BaseException:
+        shutil.rmtree(workshop, ignore_errors=True)
+        raise
     return _demo(about, final / "video.webm")
 
 
@@ -266,21 +258,6 @@ def show(demo: Demo) -> str:
         "sha256": demo.sha256,
     }
     return "\n".join(f"{key:<7} {value}" for key, value in lines.items())
-
-
-def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
-    """Crops, mirrors and scales one frame; sides come out even, as the codec wants them."""
-    if crop is not None:
-        x, y, w, h = crop
-        frame = frame[y : y + h, x : x + w]
-    if mirror:
-        frame = frame[:, ::-1]
-    height, width = frame.shape[:2]
-    scale = min(1.0, STORED_SIDE / max(height, width))
-    size = (max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2))
-    if size == (width, height):
-        return np.ascontiguousarray(frame)
-    return cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
 
 
 def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
