@@ -37,7 +37,10 @@ class Actions:
         }  # fmt: skip
         if body["do"] not in actions:
             raise ValueError(f"there is no action {body['do'][:40]!r}")
-        actions[body["do"]](who, {key: value for key, value in body.items() if key != "do"})
+        fields = {key: value for key, value in body.items() if key != "do"}
+        actions[body["do"]](who, fields)
+        detail = ", ".join(f"{key} {value}" for key, value in fields.items() if value != "")
+        self._store.add_audit(who.name, body["do"], f"{detail}; run {self._page.trainer.run}")
 
     def _leave_out(self, who: Rater, fields: dict[str, Any]) -> None:
         self._store.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from app.bench import add_commands
 from app.cli_care import add_care_commands
 from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
+from app.cli_people import add_people_commands
 from trainer.errors import UserError
 
 
@@ -64,6 +65,15 @@ def _parser() -> argparse.ArgumentParser:
     _run_options(serve)
     serve.add_argument("--host", default="127.0.0.1", help="address to listen on (127.0.0.1)")
     serve.add_argument("--port", type=_port, default=8080, help="port of the web page (8080)")
+    serve.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
+    serve.add_argument("--tls-key", type=Path, metavar="FILE", help="its private key, PEM")
+    serve.add_argument(
+        "--behind-proxy", action="store_true", help="a proxy that speaks TLS is before it, and is believed"
+    )
+    serve.add_argument(
+        "--allow-host", action="append", default=[], metavar="NAME",
+        help="a host name that people use, such as study.example.org; may be repeated",
+    )  # fmt: skip
     serve.add_argument("--new-run", action="store_true", help="start over instead of going on")
     serve.add_argument(
         "--shared",
@@ -113,6 +123,7 @@ def _parser() -> argparse.ArgumentParser:
     for command in (add, listing, show):
         add_data_dir(command)
 
+    add_people_commands(commands, _command)
     add_data_commands(commands, _command)
     add_care_commands(commands, _command)
 
@@ -201,9 +212,14 @@ def _config(arguments: argparse.Namespace) -> Any:
 
 def _serve(arguments: argparse.Namespace) -> None:
     from app.assignment import Again
+    from app.listening import Listening
     from app.serve import serve
     from trainer.demos import find_demo
 
+    listening = Listening(
+        host=arguments.host, port=arguments.port, tls_cert=arguments.tls_cert, tls_key=arguments.tls_key,
+        behind_proxy=arguments.behind_proxy, names=tuple(arguments.allow_host),
+    )  # fmt: skip
     config = _config(arguments)
     try:
         again = Again(shared=arguments.shared, repeated=arguments.repeated)
@@ -216,8 +232,7 @@ def _serve(arguments: argparse.Namespace) -> None:
         explicit=bool(arguments.settings)
         or any(getattr(arguments, key) is not None for key in ("config", *_SETTINGS)),
         encoder_weights=arguments.encoder_weights,
-        host=arguments.host,
-        port=arguments.port,
+        listening=listening,
         run=arguments.run_name,
         new_run=arguments.new_run,
         again=again,

@@ -1,4 +1,4 @@
-"""The commands for people and data: ``rater``, ``export``, ``import``."""
+"""The commands for data: ``export``, ``import``; and what commands of all kinds share."""
 
 from __future__ import annotations
 
@@ -19,18 +19,6 @@ def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentPar
         commands: Where sub-commands are added.
         command: Adds one: (commands, name, function, summary).
     """
-    rater = command(commands, "rater", None, "people and their links")
-    actions = rater.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=type(rater))
-    new = command(actions, "add", _rater_add, "a new rater; prints the link to send")
-    new.add_argument("name")
-    new.add_argument("--researcher", action="store_true", help="may watch, steer and export too")
-    new.add_argument("--url", default="http://127.0.0.1:8080", help="address people reach the page at")
-    people = command(actions, "list", _rater_list, "everybody")
-    revoke = command(actions, "revoke", _rater_revoke, "end a rater's links and sessions; ratings stay")
-    revoke.add_argument("name")
-    for parser in (new, people, revoke):
-        add_data_dir(parser)
-
     export = command(commands, "export", _export, "the ratings as CSV, what was rated as Parquet")
     add_data_dir(export)
     export.add_argument("--out", type=Path, metavar="FILE", help="the CSV; standard output if not given")
@@ -58,32 +46,6 @@ def check_output(file: Path, data_dir: Path) -> None:
     check_writable(file)
     if file.absolute().parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
         raise UserError(f"{file} is the database; choose another name")
-
-
-def _rater_add(arguments: argparse.Namespace) -> None:
-    from app.links import issue_link, read_secret
-
-    name = arguments.name
-    if not 1 <= len(name.strip()) <= 64 or not name.isprintable():
-        raise UserError(f"a rater's name is 1 to 64 printable characters, got {name[:80]!r}")
-    with open_store(arguments) as store:
-        rater = store.ensure_rater(name.strip(), "researcher" if arguments.researcher else "annotator")
-        print(issue_link(store, read_secret(arguments.data_dir), rater, arguments.url))
-
-
-def _rater_list(arguments: argparse.Namespace) -> None:
-    with open_store(arguments, must_exist=True) as store:
-        for rater in store.raters():
-            print(f"{rater.name:24} {rater.role}")
-
-
-def _rater_revoke(arguments: argparse.Namespace) -> None:
-    with open_store(arguments, must_exist=True) as store:
-        raters = {rater.name: rater for rater in store.raters()}
-        if arguments.name not in raters:
-            raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
-        ended = store.revoke_tokens(raters[arguments.name].id)
-        print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
 
 
 def _export(arguments: argparse.Namespace) -> None:

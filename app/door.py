@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable
+from html import escape
 from typing import Literal, NamedTuple
 
 from aiohttp import web
 
 from app import assets
+from app.limits import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
 from app.links import hash_token, new_session_token
+from app.listening import Listening
+from trainer.people import SESSION_DAYS, Link
 from trainer.records import Rater
 from trainer.store import Store
 
@@ -28,6 +32,8 @@ class Route(NamedTuple):
     path: str
     role: Role
     handler: Handler
+    audit: str = ""
+    """What the audit log says when it was served; "" for what is not worth a line."""
 
 
 RATER = web.RequestKey("rater", Rater)
@@ -51,7 +57,6 @@ SECURITY_HEADERS = {
 
 _RANK = {"annotator": 1, "researcher": 2}
 """Each may do what those before it may. Whoever is not named is a stranger."""
-_SESSION_DAYS = 30
 _MOST_SESSIONS = 8
 """Sessions of one browser that are looked at."""
 
@@ -61,20 +66,23 @@ class Door:
 
     Args:
         store: Knows the tokens.
+        listening: Which hosts may be named, and who asks.
         port: Tells the port of the front, once it is open.
     """
 
-    def __init__(self, store: Store, port: Callable[[], int]) -> None:
+    def __init__(self, store: Store, listening: Listening, port: Callable[[], int]) -> None:
         self._store = store
+        self._listening = listening
         self._port = port
+        self._wrong = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
         self._login = (assets.STATIC / "login.html").read_text()
 
     def application(self, routes: Iterable[Route]) -> web.Application:
         """A server of these routes and nothing else."""
         table = tuple(routes)
         self._least = {route.handler: _RANK.get(route.role, 0) for route in table}
+        self._audited = {route.handler: route.audit for route in table if route.audit}
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
-        # Not web.get: it would add HEAD, which would open links without anybody looking.
         app.add_routes([web.route(route.method, route.path, route.handler) for route in table])
         return app
 
@@ -85,13 +93,20 @@ class Door:
         except web.HTTPException as problem:
             response = problem
         if not response.prepared:
-            response.headers.update(SECURITY_HEADERS)
+            for name, value in SECURITY_HEADERS.items():
+                response.headers.setdefault(name, value)
             response.headers.setdefault("Cache-Control", "no-store")
         if isinstance(response, web.HTTPException):
             raise response
         return response
 
     async def _let_in(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        if not self._listening.knows(request.host):
+            raise web.HTTPMisdirectedRequest(
+                text="onedemo does not go by this name. Whoever started it can allow it with --allow-host."
+            )
+        if request.method not in ("GET", "POST"):  # aiohttp answers HEAD by GET, which would open links
+            raise web.HTTPMethodNotAllowed(request.method, ["GET", "POST"])
         await self._recognise(request)
         have = _RANK.get(request[RATER].role, 0) if RATER in request else 0
         # An address that does not exist is no secret, but strangers are not told which ones do.
@@ -105,13 +120,15 @@ class Door:
             raise web.HTTPForbidden(text="Only researchers may do that.")
         if request.method == "POST" and not same_origin(request):
             raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        if what := self._audited.get(request.match_info.handler):
+            detail = request.query_string
+            await asyncio.to_thread(self._store.add_audit, request[RATER].name, what, detail)
         return await handler(request)
 
     async def _recognise(self, request: web.Request) -> None:
         """Notes who asks. One browser may hold sessions of several raters, each with its own tabs."""
         known: list[tuple[Rater, str]] = []
-        cookies = [value for name, value in request.cookies.items() if name.startswith(self._cookie(""))]
-        for token in cookies[:_MOST_SESSIONS]:
+        for token in self._tokens(request):
             digest = hash_token(token)
             rater = await asyncio.to_thread(self._store.rater_of, digest, "session")
             if rater is not None:
@@ -124,41 +141,102 @@ class Door:
         if known:
             request[RATER], request[SESSION] = known[0]
 
+    def _tokens(self, request: web.Request) -> list[str]:
+        prefix = self._cookie("")
+        return [value for name, value in request.cookies.items() if name.startswith(prefix)][:_MOST_SESSIONS]
+
     def _cookie(self, rater: int | str) -> str:
         # Browsers share cookies between the ports of a host; two studies on one machine must not.
         return f"onedemo-{self._port()}-{rater}"
 
-    def _login_page(self, status: int) -> web.Response:
-        notes = {
-            200: "",
-            401: "",
-            403: "This link does not work. It may be incomplete, or it was withdrawn.",
-        }
-        html = self._login.replace("<!-- note -->", notes[status])
+    def _login_page(self, status: int, note: str = "", form: str = "") -> web.Response:
+        html = self._login.replace("<!-- note -->", note)
+        if form:
+            start, end = html.index("<h1>"), html.index("</main>")
+            html = html[:start] + form + html[end:]
         return web.Response(text=html, content_type="text/html", status=status)
 
     async def log_in(self, request: web.Request) -> web.StreamResponse:
-        """Trades the token of a link for a cookie."""
+        """Trades the token of a link for a cookie; one that opens once gets a page with a button first.
+
+        Programs that look at a link before a person does (mail scanners, previews in a chat) press no
+        button, so they do not use it up.
+        """
         token = request.query.get("token", "")
         if not token:
             return self._login_page(200)
-        rater = await asyncio.to_thread(self._store.rater_of, hash_token(token), "link")
-        if rater is None:
-            return self._login_page(403)
+        link = await asyncio.to_thread(self._store.link, hash_token(token))
+        if link is not None and link.once and link.state == "open":
+            response = self._login_page(200, form=_BUTTON.format(token=escape(token)))
+            # With no-referrer a browser would not say that it is this page that posts the form.
+            response.headers["Referrer-Policy"] = "same-origin"
+            return response
+        return await self._open(request, token, link)
+
+    async def press_button(self, request: web.Request) -> web.StreamResponse:
+        """Opens the link of the page with the button."""
+        fields = await request.post()
+        token = fields.get("token", "")
+        if not isinstance(token, str) or not token:
+            return self._login_page(403, _REFUSED["unknown"])
+        link = await asyncio.to_thread(self._store.link, hash_token(token))
+        return await self._open(request, token, link)
+
+    async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
+        if self._wrong[self._listening.client(request)].empty:
+            return self._login_page(429, _REFUSED["too many"])
         session = new_session_token()
-        await asyncio.to_thread(self._store.add_token, hash_token(session), rater.id, "session")
-        response = web.HTTPSeeOther(f"/r/{rater.id}")
+        opened = None
+        if link is not None:
+            opened = await asyncio.to_thread(self._store.open_link, hash_token(token), hash_token(session))
+        if opened is None:
+            return await self._refuse(request, token, link)
+        await asyncio.to_thread(self._store.add_audit, opened.rater.name, "came in", f"link {opened.id}")
+        response = web.HTTPSeeOther(f"/r/{opened.rater.id}")
         # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
         response.set_cookie(
-            self._cookie(rater.id),
+            self._cookie(opened.rater.id),
             session,
-            max_age=_SESSION_DAYS * 86400,
+            max_age=SESSION_DAYS * 86400,
             httponly=True,
             samesite="Lax",
-            secure=request.secure,
+            secure=self._listening.encrypted(request),
             path="/",
         )
         return response
+
+    async def _refuse(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
+        address = self._listening.client(request)
+        self._wrong[address].take()
+        why = "unknown" if link is None else link.state
+        await asyncio.to_thread(self._store.add_audit, address, "was refused", f"{why} link")
+        if link is None:
+            return self._login_page(403, _REFUSED["unknown"])
+        if link.state in ("used", "expired"):  # clicked again in the browser that it let in
+            for session in self._tokens(request):
+                if await asyncio.to_thread(self._store.came_by, hash_token(session)) == link.id:
+                    raise web.HTTPSeeOther(f"/r/{link.rater.id}")
+        # Read anew: of two who press at once, one finds it used.
+        now = await asyncio.to_thread(self._store.link, hash_token(token))
+        assert now is not None
+        return self._login_page(403, _REFUSED.get(now.state, _REFUSED["unknown"]))
+
+
+_REFUSED = {
+    "too many": "Too many wrong links came from your address. Please try again in a minute.",
+    "unknown": "This link does not work. It may be incomplete.",
+    "used": "This link was used already, and opens only once. Please ask for another.",
+    "expired": "The time of this link is over. Please ask for another.",
+    "revoked": "This link was withdrawn. Please ask for another if you still take part.",
+}
+_BUTTON = f"""<h1>Your link opens once</h1>
+      <p>Press the button in the browser in which you want to take part. You can then come back to it for
+      {SESSION_DAYS} days.</p>
+      <form method="post" action="/login">
+        <input type="hidden" name="token" value="{{token}}">
+        <button>Come in</button>
+      </form>
+    """
 
 
 def same_origin(request: web.Request) -> bool:

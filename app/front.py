@@ -22,6 +22,7 @@ from app.actions import Actions
 from app.door import RATER, SECURITY_HEADERS, Door, Route
 from app.downloads import Downloads
 from app.files import Files, Filmed
+from app.listening import Listening
 from app.pictures import Pictures
 from app.proxy import Proxy
 from trainer.errors import UserError
@@ -75,19 +76,20 @@ class Front:
 
     Args:
         page: The Viser page behind the door; its trainer is the run that is served.
-        host: Address to listen on.
-        port: Port to listen on; 0 takes a free one.
+        listening: Where to listen, and under which names.
     """
 
-    def __init__(self, page: Inside, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, page: Inside, listening: Listening) -> None:
         store = page.trainer.store
         self._page = page
-        self._host = host
-        self._port = port
+        self._listening = listening
+        self._host = listening.host
+        self._port = listening.port
+        self._tls = listening.ssl_context()
         self._actions = Actions(page)
         self._files = Files(page)
         self._downloads = Downloads(store, SECURITY_HEADERS)
-        self._door = Door(store, lambda: self._port)
+        self._door = Door(store, listening, lambda: self._port)
         self._proxy = Proxy(page, store)
         self._html = assets.page_html()
         self._loop = asyncio.new_event_loop()
@@ -104,6 +106,7 @@ class Front:
         files, downloads = self._files, self._downloads
         return (
             Route("GET", "/login", "stranger", self._door.log_in),
+            Route("POST", "/login", "stranger", self._door.press_button),
             Route("GET", "/healthz", "stranger", self._health),
             *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
             Route("GET", "/", "annotator", self._home),
@@ -116,10 +119,10 @@ class Front:
             Route("GET", r"/demo/frames/{index:\d{1,6}}.jpg", "annotator", files.demo_frame),
             Route("GET", r"/demo/examples/{name:[a-z]{1,20}}.jpg", "annotator", files.demo_example),
             Route("GET", r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", "researcher", files.rollout),
-            Route("GET", "/export.csv", "researcher", downloads.csv),
-            Route("GET", "/comparisons.csv", "researcher", downloads.comparisons),
-            Route("GET", "/segments.parquet", "researcher", downloads.parquet),
-            Route("GET", "/card.md", "researcher", downloads.card),
+            Route("GET", "/export.csv", "researcher", downloads.csv, "took out ratings"),
+            Route("GET", "/comparisons.csv", "researcher", downloads.comparisons, "took out comparisons"),
+            Route("GET", "/segments.parquet", "researcher", downloads.parquet, "took out segments"),
+            Route("GET", "/card.md", "researcher", downloads.card, "took out the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
         )
 
@@ -140,7 +143,8 @@ class Front:
             self._thread.join()
             raise _explain(failure[0], self._host, self._port) from None
         shown = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host
-        return f"http://{f'[{shown}]' if ':' in shown else shown}:{self._port}"
+        scheme = "http" if self._tls is None else "https"
+        return f"{scheme}://{f'[{shown}]' if ':' in shown else shown}:{self._port}"
 
     def close(self) -> None:
         """Closes the port and every connection."""
@@ -167,7 +171,7 @@ class Front:
         await runner.setup()
         await self._proxy.open()
         try:
-            site = web.TCPSite(runner, self._host, self._port)
+            site = web.TCPSite(runner, self._host, self._port, ssl_context=self._tls)
             await site.start()
             self._port = runner.addresses[0][1]
             ready.set()

@@ -10,9 +10,9 @@ from typing import Any
 
 from app.columns import RATINGS
 from app.parquet import read_about, read_segments
-from trainer.demo_checks import check_name
 from trainer.errors import UserError
 from trainer.files import write_atomic
+from trainer.names import LONGEST, check_name
 from trainer.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
@@ -49,6 +49,8 @@ def import_data(ratings: Path, segments: Path, data_dir: Path) -> dict[str, int]
                     raise UserError(f"{ratings}, line {number}: clip {row['clip_id']} is not in {segments}")
                 if row["rater"] not in raters:
                     role = roles.get(row["rater"], "annotator")
+                    if not 1 <= len(row["rater"]) <= LONGEST or not row["rater"].isprintable():
+                        raise UserError(f"{ratings}, line {number}: {row['rater'][:80]!a} is no rater's name")
                     raters[row["rater"]] = store.ensure_rater(row["rater"], role).id
                 try:
                     store.restore_rating(row, raters[row["rater"]])

@@ -1,7 +1,7 @@
-"""Links for people: long tokens derived from one secret file, so that only hashes need storing.
+"""Links for people. The database holds nothing but the SHA-256 of the token in each.
 
-A token is HMAC-SHA256(secret, rater), so the same links are printed at every start although the
-database holds nothing but their SHA-256.
+The token of a standing link is HMAC-SHA256(secret, rater), with a secret file in the data directory,
+so the same links are printed at every start. That of a link that ends by itself is random.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import hashlib
 import hmac
 import os
 import secrets
+from datetime import timedelta
 from pathlib import Path
 
 from trainer.errors import UserError
@@ -19,6 +20,7 @@ from trainer.store import Store
 
 SECRET_FILE = "link-secret"
 SECRET_BYTES = 32
+_UNITS = {"m": timedelta(minutes=1), "h": timedelta(hours=1), "d": timedelta(days=1)}
 
 
 def link_token(secret: bytes, rater: Rater, generation: int = 0) -> str:
@@ -68,7 +70,7 @@ def read_secret(data_dir: Path) -> bytes:
 
 
 def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
-    """The link that lets a rater in, known to the store from now on: the same until it is revoked.
+    """The standing link that lets a rater in, known to the store from now on: the same until it is revoked.
 
     Args:
         store: Keeps the hash of the token.
@@ -79,6 +81,39 @@ def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
     token = link_token(secret, rater, store.count_revoked_links(rater.id))
     store.add_token(hash_token(token), rater.id, "link")
     return f"{base_url.rstrip('/')}/login?token={token}"
+
+
+def passing_link(
+    store: Store, rater: Rater, base_url: str, *, once: bool = False, lasts: timedelta | None = None
+) -> str:
+    """A new link that ends by itself; nobody can print it again.
+
+    Args:
+        store: Keeps the hash of the token.
+        rater: Whom the link is for.
+        base_url: Of the front.
+        once: Whether it opens once.
+        lasts: Until it expires; None: it does not.
+    """
+    token = new_session_token()
+    store.add_token(hash_token(token), rater.id, "link", once=once, lasts=lasts)
+    return f"{base_url.rstrip('/')}/login?token={token}"
+
+
+def read_span(text: str) -> timedelta:
+    """A time such as "30m", "12h" or "7d".
+
+    Raises:
+        UserError: If it is none, or not from a minute to ten years.
+    """
+    number, unit = text[:-1], _UNITS.get(text[-1:])
+    if unit is not None and number.isascii() and number.isdigit() and len(number) <= 6:
+        span = int(number) * unit
+        if timedelta(minutes=1) <= span <= timedelta(days=3653):
+            return span
+    raise UserError(
+        f"a time is a number with m, h or d, such as 12h or 7d, up to ten years; got {text[:40]!r}"
+    )
 
 
 def _create(path: Path) -> None:

@@ -6,12 +6,24 @@ Viser serves nothing else that a browser needs, so nothing else is passed on.
 from __future__ import annotations
 
 import asyncio
-from functools import partial
+import sqlite3
 from typing import Protocol
 
-from aiohttp import ClientSession, WSMsgType, web
+from aiohttp import ClientSession, ClientWebSocketResponse, WSCloseCode, WSMsgType, web
 
 from app.door import RATER, SESSION, same_origin
+from app.limits import (
+    BYTES_AT_ONCE,
+    BYTES_PER_S,
+    LARGEST_MESSAGE,
+    MESSAGES_AT_ONCE,
+    MESSAGES_PER_S,
+    MOST_PAGES,
+    MOST_PAGES_EACH,
+    Bucket,
+    Places,
+)
+from app.messages import known
 from trainer.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"
@@ -19,8 +31,8 @@ SECRET_HEADER = "X-Onedemo-Secret"
 SESSION_HEADER = "X-Onedemo-Session"
 SCHEME_HEADER = "X-Onedemo-Scheme"
 
-_MAX_CLIENT_MESSAGE = 1 << 20
-"""Bytes a browser may send in one message; what the page needs is a few hundred."""
+_LOOK_S = 1.0
+"""How soon a page is closed whose session has ended."""
 
 
 class Behind(Protocol):
@@ -40,15 +52,21 @@ class Proxy:
 
     def __init__(self, page: Behind, store: Store) -> None:
         self._page, self._store = page, store
-        self._sockets: set[web.WebSocketResponse] = set()
+        self._sockets: dict[web.WebSocketResponse, str] = {}
+        """Each open page, with the session it belongs to."""
+        self._places = Places(MOST_PAGES, MOST_PAGES_EACH)
         self._upstream: ClientSession | None = None
+        self._watching: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Makes it ready, in the loop it is used in."""
         self._upstream = ClientSession()
+        self._watching = asyncio.ensure_future(self._end_sessions())
 
     async def close(self) -> None:
         """Closes every page's socket."""
+        if self._watching is not None:
+            self._watching.cancel()
         for browser in tuple(self._sockets):
             await browser.close(code=1001)
         if self._upstream is not None:
@@ -58,6 +76,14 @@ class Proxy:
         """Joins a browser's socket to one of Viser's until either ends or the session is revoked."""
         if not same_origin(request):
             raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        with self._places.one(request[RATER].id) as free:
+            if not free:
+                raise web.HTTPServiceUnavailable(
+                    text="Too many pages are open. Close some and reload this one."
+                )
+            return await self._join(request)
+
+    async def _join(self, request: web.Request) -> web.StreamResponse:
         assert self._upstream is not None
         offered = request.headers.get("Sec-WebSocket-Protocol", "")
         protocols = [name.strip() for name in offered.split(",") if name.strip()]
@@ -77,41 +103,54 @@ class Proxy:
         )
         async with inside:
             outside = web.WebSocketResponse(
-                protocols=protocols, heartbeat=30, max_msg_size=_MAX_CLIENT_MESSAGE, compress=False
+                protocols=protocols, heartbeat=30, max_msg_size=LARGEST_MESSAGE, compress=False
             )
             await outside.prepare(request)
-            self._sockets.add(outside)
+            self._sockets[outside] = request[SESSION]
             try:
-                await self._pump(request[SESSION], inside, outside)
+                await _pump(inside, outside)
             finally:
-                self._sockets.discard(outside)
+                del self._sockets[outside]
                 await outside.close()
         return outside
 
-    async def _pump(self, session: str, inside, outside: web.WebSocketResponse) -> None:
-        tasks = [
-            asyncio.ensure_future(_forward(inside, outside)),
-            asyncio.ensure_future(_forward(outside, inside)),
-            asyncio.ensure_future(self._until_revoked(session)),
-        ]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _until_revoked(self, session: str) -> None:
-        look = partial(self._store.rater_of, session, "session")
-        while await asyncio.to_thread(look) is not None:
-            await asyncio.sleep(5)
+    async def _end_sessions(self) -> None:
+        """Closes pages whose session was revoked or has expired."""
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            try:
+                ended = await asyncio.to_thread(self._store.ended, set(self._sockets.values()))
+            except sqlite3.Error:  # locked, say: it is looked at again
+                continue
+            for browser, session in tuple(self._sockets.items()):
+                if session in ended:
+                    await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this link was withdrawn")
 
 
-async def _forward(source, target) -> None:
-    async for message in source:
-        if message.type is WSMsgType.BINARY:
-            await target.send_bytes(message.data)
-        elif message.type is WSMsgType.TEXT:
-            await target.send_str(message.data)
-        else:
+async def _pump(inside: ClientWebSocketResponse, outside: web.WebSocketResponse) -> None:
+    tasks = [asyncio.ensure_future(_show(inside, outside)), asyncio.ensure_future(_listen(outside, inside))]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _show(inside: ClientWebSocketResponse, outside: web.WebSocketResponse) -> None:
+    """Passes on what the page says to the browser."""
+    async for message in inside:
+        if message.type is not WSMsgType.BINARY:
             return
+        await outside.send_bytes(message.data)
+
+
+async def _listen(outside: web.WebSocketResponse, inside: ClientWebSocketResponse) -> None:
+    """Passes on what a browser may say, and drops the rest; a flood ends the connection."""
+    messages, sizes = Bucket(MESSAGES_PER_S, MESSAGES_AT_ONCE), Bucket(BYTES_PER_S, BYTES_AT_ONCE)
+    async for message in outside:
+        if not (messages.take() and sizes.take(len(message.data or b""))):
+            await outside.close(code=WSCloseCode.POLICY_VIOLATION, message=b"too many messages")
+            return
+        if message.type is WSMsgType.BINARY and known(message.data):
+            await inside.send_bytes(message.data)

@@ -10,6 +10,7 @@ from pathlib import Path
 from app.assignment import Again
 from app.front import Front, check_port
 from app.links import issue_link, read_secret
+from app.listening import Listening
 from app.server import Page
 from app.study import Study
 from trainer.config import RunConfig
@@ -30,8 +31,7 @@ def serve(
     config: RunConfig,
     explicit: bool,
     encoder_weights: Path | None,
-    host: str,
-    port: int,
+    listening: Listening,
     run: str | None,
     new_run: bool,
     again: Again,
@@ -47,8 +47,7 @@ def serve(
         config: Settings of a new run.
         explicit: Whether a run that is gone on with must have these settings, too.
         encoder_weights: Weights of the encoder, if not its own.
-        host: Address to listen on.
-        port: Port of the page.
+        listening: Where people reach the page.
         run: Name of the run to go on with or to make; None: the newest of this demo.
         new_run: Start over even if there is a run of this demo.
         again: How many clips are asked again.
@@ -57,7 +56,8 @@ def serve(
     Raises:
         UserError: If the data directory, the port or the graphics library cannot be used.
     """
-    check_port(host, port)
+    listening.ssl_context()  # before anything is written
+    check_port(listening.host, listening.port)
     sys.setswitchinterval(_SWITCH_SECONDS)
     store = Store(data_dir)
     renderer = RenderThread()
@@ -73,7 +73,7 @@ def serve(
     study.serve(run, demo, config)
     page = Page(study.trainer, again=again, study=study, compare=compare)
     study.served = page.serve
-    front = Front(page, host=host, port=port)
+    front = Front(page, listening)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

@@ -124,8 +124,10 @@ class Watch:
     def _toggle(self) -> None:
         if self._trainer.status().phase in ("paused", "failed", "stopped"):
             self._trainer.resume()
+            self._log("resumed the run")
         else:
             self._trainer.pause()
+            self._log("paused the run")
         self.refresh(self._trainer.status())
 
     def _stop(self) -> None:
@@ -134,8 +136,12 @@ class Watch:
             sure = time.monotonic() < self._confirm_until
             self._confirm_until = 0.0 if sure else time.monotonic() + _CONFIRM_SECONDS
         if sure:
+            self._log("stopped the run")
             self._trainer.stop()
         self.refresh(self._trainer.status())
+
+    def _log(self, what: str) -> None:
+        self._trainer.store.add_audit(self._session.rater.name, what, self._trainer.run)
 
     # The robot
 

@@ -82,6 +82,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
     from app.assignment import Again
     from app.front import Front
     from app.links import issue_link, read_secret
+    from app.listening import Listening
     from app.pictures import Pictures
     from app.server import Page
 
@@ -91,7 +92,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
         again=Again(shared=0, repeated=0),
     )
-    front = Front(page, port=0)
+    front = Front(page, Listening(port=0))
     url = front.start()
     site = Site(trainer, page, front, url)
     secret = read_secret(tmp_path)

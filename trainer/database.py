@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -78,7 +78,7 @@ class Database:
                 raise
             self._db.execute("COMMIT")
 
-    def rows(self, sql: str, values: Sequence = ()) -> list[tuple]:
+    def rows(self, sql: str, values: Sequence | Mapping[str, object] = ()) -> list[tuple]:
         """All rows of a short query."""
         with self._lock:
             return self._db.execute(sql, values).fetchall()

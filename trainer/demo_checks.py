@@ -9,7 +9,6 @@ Shapes: H rows, W columns.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,14 +22,6 @@ MAX_FRAMES = 200_000
 """Of the video that comes in, also of the part that is not used: nearly two hours at 30 a second."""
 MIN_SIDE, MAX_SIDE = 16, 4096
 """Pixels, of the video that comes in."""
-
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-
-
-def check_name(name: str) -> None:
-    """Raises UserError unless the name is safe as a file name and in a link."""
-    if not _NAME.fullmatch(name):
-        raise UserError(f"a name is 1 to 64 letters, digits, '-' or '_', got {name[:80]!r}")
 
 
 class SourceWatch:

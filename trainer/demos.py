@@ -23,10 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from trainer.demo_checks import check_name, check_options
+from trainer.demo_checks import check_options
 from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.guarded import Limits, Options, decode
+from trainer.names import check_name
 from trainer.records import Demo
 from trainer.timing import steps_of_frames
 from trainer.video import VideoReader, write_webm

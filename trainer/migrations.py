@@ -284,6 +284,41 @@ STEPS: tuple[str, ...] = (
             WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id AND l.id > c.id
         );
     """,
+    # 5: links that end by themselves, sessions that know by which link they came, and a log of who came in
+    # and took what. Tokens are laid out anew for this; sessions of before end as they would have.
+    """
+    CREATE TABLE tokens_new (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        hash TEXT NOT NULL UNIQUE,      -- SHA-256 of the token, never the token
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        kind TEXT NOT NULL CHECK (kind IN ('link', 'session')),
+        link_id INTEGER REFERENCES tokens_new (id),  -- of a session: the link it came by, if that is known
+        once INTEGER NOT NULL DEFAULT 0 CHECK (once IN (0, 1)),  -- of a link: it opens once
+        created_at TEXT NOT NULL,
+        expires_at TEXT,                -- none: it does not
+        last_used_at TEXT,
+        revoked_at TEXT
+    );
+    INSERT INTO tokens_new (hash, rater_id, kind, created_at, expires_at, revoked_at)
+        SELECT hash, rater_id, kind, created_at,
+               CASE kind WHEN 'session' THEN strftime('%Y-%m-%dT%H:%M:%fZ', created_at, '+30 days') END,
+               revoked_at
+        FROM tokens ORDER BY rowid;
+    DROP TABLE tokens;
+    ALTER TABLE tokens_new RENAME TO tokens;
+    CREATE INDEX tokens_by_rater ON tokens (rater_id, kind);
+    CREATE TABLE audit (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        at TEXT NOT NULL,
+        who TEXT NOT NULL,              -- a rater, "command line", or the address of a stranger
+        what TEXT NOT NULL,
+        detail TEXT NOT NULL DEFAULT ''
+    );
+    CREATE TRIGGER audit_keep_update BEFORE UPDATE ON audit
+        BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END;
+    CREATE TRIGGER audit_keep_delete BEFORE DELETE ON audit
+        BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END;
+    """,
 )
 
 

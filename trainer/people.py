@@ -1,13 +1,47 @@
-"""People in the database, and the links that let them in."""
+"""People in the database, and the links and sessions that let them in.
+
+Only hashes of tokens are kept: who reads the database cannot come in with what it holds.
+"""
 
 from __future__ import annotations
 
-from trainer.database import Database, now
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Literal
+
+from trainer.audit import Audit
+from trainer.database import now
 from trainer.errors import UserError
 from trainer.records import Rater
 
+SESSION_DAYS = 30
+"""How long a cookie lets in."""
 
-class People(Database):
+# A time is compared as text: all are UTC in one form (trainer.database.now).
+_STATE = (
+    "CASE WHEN t.revoked_at IS NOT NULL THEN 'revoked' WHEN t.once AND t.last_used_at IS NOT NULL THEN 'used'"
+    " WHEN t.expires_at <= :now THEN 'expired' ELSE 'open' END"
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Link:
+    """A link that was given to somebody; the token in it is known to nobody but them."""
+
+    id: int
+    rater: Rater
+    once: bool
+    """It opens once."""
+    state: Literal["open", "used", "expired", "revoked"]
+    created_at: str
+    expires_at: str | None
+    last_used_at: str | None
+
+
+_LINK = f"t.id, p.id, p.name, p.role, t.once, {_STATE}, t.created_at, t.expires_at, t.last_used_at"
+
+
+class People(Audit):
     """Raters and their tokens."""
 
     def ensure_rater(self, name: str, role: str) -> Rater:
@@ -32,33 +66,90 @@ class People(Database):
         rows = self.rows("SELECT id, name, role FROM raters ORDER BY id")
         return [Rater(id=i, name=n, role=r) for i, n, r in rows]
 
-    def add_token(self, token_hash: str, rater_id: int, kind: str) -> None:
-        """Lets a token stand for a rater; a token that is known already stays as it is.
+    # Links and sessions
+
+    def add_token(
+        self, token_hash: str, rater_id: int, kind: Literal["link", "session"], *,
+        lasts: timedelta | None = None, once: bool = False, link_id: int | None = None,
+    ) -> int:  # fmt: skip
+        """Lets a token stand for a rater and returns its number; one that is known stays as it is.
 
         Args:
             token_hash: SHA-256 of the token, hex.
             rater_id: Whose it is.
-            kind: "link" or "session".
+            kind: What it is.
+            lasts: Until it expires; None: it does not.
+            once: Whether a link opens once.
+            link_id: By which link a session came.
         """
         with self.transaction() as db:
             db.execute(
-                "INSERT OR IGNORE INTO tokens (hash, rater_id, kind, created_at) VALUES (?, ?, ?, ?)",
-                (token_hash, rater_id, kind, now()),
+                "INSERT OR IGNORE INTO tokens (hash, rater_id, kind, link_id, once, created_at, expires_at)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (token_hash, rater_id, kind, link_id, once, now(), _in(lasts)),
             )
+            return db.execute("SELECT id FROM tokens WHERE hash = ?", (token_hash,)).fetchone()[0]
 
-    def rater_of(self, token_hash: str, kind: str) -> Rater | None:
-        """Whose token that is, or None if it is unknown or revoked."""
+    def rater_of(self, token_hash: str, kind: Literal["link", "session"]) -> Rater | None:
+        """Whose token that is, or None if it is unknown, revoked, expired or used up."""
         rows = self.rows(
             "SELECT p.id, p.name, p.role FROM tokens t JOIN raters p ON p.id = t.rater_id"
-            " WHERE t.hash = ? AND t.kind = ? AND t.revoked_at IS NULL",
-            (token_hash, kind),
+            f" WHERE t.hash = :hash AND t.kind = :kind AND {_STATE} = 'open'",
+            {"hash": token_hash, "kind": kind, "now": now()},
         )
         return Rater(id=rows[0][0], name=rows[0][1], role=rows[0][2]) if rows else None
 
+    def link(self, token_hash: str) -> Link | None:
+        """The link of that token, whatever has become of it; None if there never was one."""
+        return next(iter(self._links("t.hash = :hash", {"hash": token_hash})), None)
+
+    def links(self) -> list[Link]:
+        """All links there ever were, in the order they were made."""
+        return self._links("TRUE", {})
+
+    def open_link(self, token_hash: str, session_hash: str) -> Link | None:
+        """Trades a link for a session; None if it does not open (any more). Of two at once, one may win.
+
+        Args:
+            token_hash: Of the link.
+            session_hash: Of the session's token, which lasts 30 days.
+        """
+        with self.transaction() as db:
+            link = self.link(token_hash)
+            if link is None or link.state != "open":
+                return None
+            db.execute("UPDATE tokens SET last_used_at = ? WHERE id = ?", (now(), link.id))
+            lasts = timedelta(days=SESSION_DAYS)
+            self.add_token(session_hash, link.rater.id, "session", lasts=lasts, link_id=link.id)
+        return link
+
+    def came_by(self, session_hash: str) -> int | None:
+        """The number of the link by which a session that holds came, if that is known."""
+        rows = self.rows(
+            f"SELECT t.link_id FROM tokens t WHERE t.hash = :hash AND {_STATE} = 'open'",
+            {"hash": session_hash, "now": now()},
+        )
+        return rows[0][0] if rows else None
+
+    def ended(self, session_hashes: set[str]) -> set[str]:
+        """Which of these sessions do not hold any more."""
+        hashes = sorted(session_hashes)
+        open_ones: set[str] = set()
+        for start in range(0, len(hashes), 500):  # SQLite takes a limited number of values
+            some = {f"h{number}": value for number, value in enumerate(hashes[start : start + 500])}
+            places = ", ".join(f":{name}" for name in some)
+            query = (
+                "SELECT t.hash FROM tokens t"
+                f" WHERE t.hash IN ({places}) AND t.kind = 'session' AND {_STATE} = 'open'"
+            )
+            open_ones |= {row[0] for row in self.rows(query, some | {"now": now()})}
+        return session_hashes - open_ones
+
     def count_revoked_links(self, rater_id: int) -> int:
-        """How many links of a rater were ended."""
+        """How many standing links of a rater were revoked: those that neither expire nor open once."""
         return self.rows(
-            "SELECT COUNT(*) FROM tokens WHERE rater_id = ? AND kind = 'link' AND revoked_at IS NOT NULL",
+            "SELECT COUNT(*) FROM tokens WHERE rater_id = ? AND kind = 'link' AND revoked_at IS NOT NULL"
+            " AND NOT once AND expires_at IS NULL",
             (rater_id,),
         )[0][0]
 
@@ -69,6 +160,39 @@ class People(Database):
                 "UPDATE tokens SET revoked_at = ? WHERE rater_id = ? AND revoked_at IS NULL",
                 (now(), rater_id),
             ).rowcount
+
+    def revoke_link(self, link_id: int) -> Link:
+        """Ends one link and the sessions that came by it, or by an unknown one of the same rater.
+
+        Raises:
+            UserError: If there is no such link.
+        """
+        with self.transaction() as db:
+            link = next(iter(self._links("t.id = :id", {"id": link_id})), None)
+            if link is None:
+                raise UserError(f"there is no link {link_id}; see `onedemo rater links`")
+            db.execute(
+                "UPDATE tokens SET revoked_at = :now WHERE revoked_at IS NULL AND (id = :id OR link_id = :id"
+                " OR (kind = 'session' AND link_id IS NULL AND rater_id = :rater))",
+                {"now": now(), "id": link_id, "rater": link.rater.id},
+            )
+        return link
+
+    def _links(self, where: str, values: dict) -> list[Link]:
+        rows = self.rows(
+            f"SELECT {_LINK} FROM tokens t JOIN raters p ON p.id = t.rater_id"
+            f" WHERE t.kind = 'link' AND {where} ORDER BY t.id",
+            values | {"now": now()},
+        )
+        return [
+            Link(
+                id=number, rater=Rater(id=rater, name=name, role=role), once=bool(once), state=state,
+                created_at=created, expires_at=expires, last_used_at=used,
+            )
+            for number, rater, name, role, once, state, created, expires, used in rows
+        ]  # fmt: skip
+
+    # Practice
 
     def has_practised(self, rater_id: int) -> bool:
         """Whether a rater has done the practice clips, or rated before there were any."""
@@ -84,3 +208,9 @@ class People(Database):
         """Notes that a rater has done the practice clips."""
         with self.transaction() as db:
             db.execute("UPDATE raters SET practised_at = ? WHERE id = ?", (now(), rater_id))
+
+
+def _in(lasts: timedelta | None) -> str | None:
+    if lasts is None:
+        return None
+    return (datetime.now(UTC) + lasts).isoformat(timespec="milliseconds").replace("+00:00", "Z")

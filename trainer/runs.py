@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from trainer.config import RunConfig, load_config, to_toml
-from trainer.demo_checks import check_name
 from trainer.errors import UserError
 from trainer.files import write_atomic
 from trainer.learner import lengths
+from trainer.names import check_name
 from trainer.records import Demo
 from trainer.store import Store
 

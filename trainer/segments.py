@@ -1,7 +1,7 @@
 """A segment as bytes, the way the database keeps it: a NumPy file (NPY) of W records.
 
 Each record holds one control step. The header names the arrays, their types and their widths, so the
-file explains itself and NumPy alone reads it: ``np.load(io.BytesIO(data))["obs"]``.
+file explains itself and NumPy alone reads it: ``np.load(io.BytesIO(data), allow_pickle=False)["obs"]``.
 """
 
 from __future__ import annotations

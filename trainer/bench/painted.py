@@ -68,7 +68,7 @@ def measure(quick: bool) -> list[Result]:
     if sys.platform != "linux" or find_chromium() is None:
         return [Skipped(name="painted", reason="there is no Chromium: install the package chromium")]
     with tempfile.TemporaryDirectory(prefix="onedemo-bench-") as place:
-        return asyncio.run(_measure(Path(place) / "data", *((1, 20) if quick else (5, 60))))
+        return asyncio.run(_measure(Path(place) / "data", *((1, 20) if quick else (3, 60))))
 
 
 async def _measure(data_dir: Path, turns: int, presses: int) -> list[Result]:

@@ -236,7 +236,7 @@ class Stocked:
 
     def fill(self, clips: int) -> None:
         """Lets so many clips wait to be rated, beside those at open pages."""
-        self.supply.fill(_IN_HAND * len(self.tabs) + clips)
+        self.supply.fill(_IN_HAND * len(self.tabs) + _SPARE + clips)
 
     async def open(self, people: int) -> None:
         """Opens pages until so many people are there, each with a clip."""

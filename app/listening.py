@@ -1,0 +1,113 @@
+"""Where the front listens, and under which names it may be spoken to."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import ssl
+from dataclasses import dataclass
+from pathlib import Path
+
+from aiohttp import web
+
+from trainer.errors import UserError
+
+_HOST_NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]*[a-z0-9])?(\.[a-z0-9]([a-z0-9-]*[a-z0-9])?)*")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listening:
+    """Address, encryption and names.
+
+    Raises:
+        UserError: If strangers could listen in: an address that other machines reach, without TLS and
+            without a proxy that has it; or if half of a pair of files is missing.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    """0 takes a free one."""
+    tls_cert: Path | None = None
+    """Certificate chain, PEM."""
+    tls_key: Path | None = None
+    """Its private key, PEM."""
+    behind_proxy: bool = False
+    """A proxy speaks TLS with people, and is the only one that can reach this address. It is believed
+    who asks (the last of X-Forwarded-For) and how (X-Forwarded-Proto)."""
+    names: tuple[str, ...] = ()
+    """Host names that people use, besides this machine's numbers and localhost."""
+
+    def __post_init__(self) -> None:
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise UserError("--tls-cert and --tls-key go together: give both, or neither")
+        if not (is_loopback(self.host) or self.tls_cert or self.behind_proxy):
+            raise UserError(
+                f"--host {self.host} lets other machines in, and without TLS they can read along: give "
+                "--tls-cert and --tls-key, or put a proxy that speaks TLS before it and say --behind-proxy"
+            )
+        for name in self.names:
+            if not _HOST_NAME.fullmatch(name.lower()):
+                raise UserError(
+                    f"--allow-host takes a host name such as study.example.org, got {name[:80]!a}"
+                )
+
+    def ssl_context(self) -> ssl.SSLContext | None:
+        """What encrypts; None if nothing does.
+
+        Raises:
+            UserError: If certificate or key cannot be used.
+        """
+        if self.tls_cert is None or self.tls_key is None:
+            return None
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        try:
+            context.load_cert_chain(self.tls_cert, self.tls_key)
+        except (OSError, ssl.SSLError) as error:
+            raise UserError(
+                f"cannot use the certificate {self.tls_cert} with the key {self.tls_key}: {error}"
+            ) from None
+        return context
+
+    def knows(self, host: str) -> bool:
+        """Whether a request may name this host: a number, localhost, or a name that was allowed.
+
+        A page of a stranger whose name leads to this machine (DNS rebinding) sends that name.
+
+        Args:
+            host: The Host header, with or without a port.
+        """
+        found = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[^:\[\]]+)(:\d{1,5})?", host)
+        if found is None:
+            return False
+        name = found[1].strip("[]").lower().rstrip(".")
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return name == "localhost" or name in {allowed.lower() for allowed in self.names}
+        return True
+
+    def client(self, request: web.BaseRequest) -> str:
+        """The address of who asks."""
+        if self.behind_proxy:
+            last = request.headers.get("X-Forwarded-For", "").rsplit(",", 1)[-1].strip()
+            try:
+                return str(ipaddress.ip_address(last))
+            except ValueError:
+                pass
+        return request.remote or "unknown"
+
+    def encrypted(self, request: web.BaseRequest) -> bool:
+        """Whether the way to the browser is encrypted: cookies then never go another way."""
+        if self.behind_proxy:
+            return request.headers.get("X-Forwarded-Proto", "").lower() == "https"
+        return request.secure
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches an address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,50 @@
+"""What may be a name: of demos and runs, which become files and addresses, and of people."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+
+from trainer.errors import UserError
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_IN_PEOPLE = frozenset(" -_.'@,()+&#")
+"""Characters in a person's name besides letters and digits."""
+LONGEST = 64
+
+
+def check_name(name: str) -> None:
+    """Raises UserError unless the name is safe as a file name and in a link."""
+    if not _NAME.fullmatch(name):
+        raise UserError(f"a name is 1 to {LONGEST} letters, digits, '-' or '_', got {_shown(name)}")
+
+
+def check_person(name: str) -> str:
+    """A person's name as it is kept: letters of any script and digits, single spaces, and ``-_.'@,()+&#``.
+
+    What draws no letter of its own (control characters, marks that turn the direction of text) and what
+    means something to a page or a file system (``<``, ``/``) is in no name.
+
+    Returns:
+        The name, composed (Unicode NFC), so that what looks the same is the same.
+
+    Raises:
+        UserError: If it is no such name.
+    """
+    composed = unicodedata.normalize("NFC", name.strip(" "))
+    fine = (
+        1 <= len(composed) <= LONGEST
+        and "  " not in composed
+        and composed[0].isalnum()
+        and all(c in _IN_PEOPLE or unicodedata.category(c)[0] in "LMN" for c in composed)
+    )
+    if not fine:
+        raise UserError(
+            f"a rater's name is 1 to {LONGEST} letters, digits, single spaces or any of -_.'@,()+&# "
+            f"and begins with a letter or digit, got {_shown(name)}"
+        )
+    return composed
+
+
+def _shown(name: str) -> str:
+    return ascii(name[:80])
