@@ -5,7 +5,9 @@ RUN apt-get update \
 WORKDIR /onedemo
 COPY . .
 RUN make setup
-ENV HOST=0.0.0.0 PORT=8080 DATA_DIR=/data
+# Every address of the container: which of this machine lead there is said where it is started
+# (docker-compose.yml: the loopback). Put a proxy with TLS before it to open it further.
+ENV HOST=0.0.0.0 PORT=8080 DATA_DIR=/data OPTIONS=--behind-proxy
 VOLUME /data
 EXPOSE 8080
 CMD ["make", "run"]

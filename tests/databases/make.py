@@ -1,0 +1,91 @@
+"""Makes the stored databases of each schema version: ``python tests/databases/make.py``.
+
+Those that are there are left as they are: a database of an old version is made once, when that version
+is the newest, and then only read.
+"""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from trainer.migrations import STEPS
+from trainer.records import Segment
+from trainer.segments import pack_segment
+
+HERE = Path(__file__).parent
+AT = "2026-01-02T03:04:05.678Z"
+SIZES = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
+
+
+def segment(number: int) -> Segment:
+    """Four steps whose numbers tell which segment it is."""
+    return Segment(**{name: np.full((4, size), number + size / 100) for name, size in SIZES.items()})
+
+
+def packed(number: int, version: int) -> bytes:
+    """A segment as that version wrote it."""
+    if version > 1:
+        return pack_segment(segment(number))
+    buffer = io.BytesIO()
+    arrays = {name: getattr(segment(number), name) for name in SIZES}
+    np.savez(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def make(version: int, file: Path) -> None:
+    """A database of that version, with rows in every table it has."""
+    with closing(sqlite3.connect(file, isolation_level=None)) as db:
+        db.execute("PRAGMA page_size = 1024")
+        for step in STEPS[:version]:
+            db.executescript(step)
+        db.execute(f"PRAGMA user_version = {version}")
+        put = db.execute
+        for name, role in (("ada", "researcher"), ("bo", "annotator"), ("oracle", "simulated")):
+            put("INSERT INTO raters (name, role, created_at) VALUES (?, ?, ?)", (name, role, AT))
+        for mark, kind, gone in (("a", "link", None), ("b", "session", None), ("c", "link", AT)):
+            put("INSERT INTO tokens (hash, rater_id, kind, created_at, revoked_at) VALUES (?, 2, ?, ?, ?)",
+                (mark * 64, kind, AT, gone))  # fmt: skip
+        put("INSERT INTO runs (id, demo, demo_sha256, seed, config, version, created_at)"
+            " VALUES ('hop-1', 'hop', 'd', 3, 'seed = 3', '0.1.0', ?)", (AT,))  # fmt: skip
+        for number in range(1, 7):
+            put("INSERT INTO clips (run, demo_step, steps, stage, iteration, snapshot, predicted, state,"
+                " created_at) VALUES ('hop-1', ?, 4, ?, 0, 1, 2.5, 'ready', ?)",
+                (10 * number, "pretrain" if number < 4 else "online", AT))  # fmt: skip
+            put("INSERT INTO segments VALUES (?, ?)", (number, packed(number, version)))
+        presses = ((1, 2, "rate", 5), (2, 2, "rate", 1), (2, 2, "undo", None), (2, 2, "rate", 2),
+                   (3, 2, "skip", None), (1, 1, "rate", 4), (4, 3, "rate", 3))  # fmt: skip
+        for clip, rater, kind, value in presses:
+            put("INSERT INTO events (clip_id, rater_id, kind, value, snapshot, predicted, latency_ms,"
+                " created_at) VALUES (?, ?, ?, ?, 1, 2.5, 900, ?)",
+                (clip, rater, kind, value, AT))  # fmt: skip
+        put("INSERT INTO snapshots VALUES ('hop-1', 1, 4, 2, '{\"loss\": 0.5}', ?)", (AT,))
+        put("INSERT INTO iterations VALUES ('hop-1', 1, 1, 16000, '{\"predicted\": 2.0}', ?)", (AT,))
+        if version >= 3:
+            put("INSERT INTO events (clip_id, rater_id, kind, value, repeat, mark_start, mark_end,"
+                " snapshot, latency_ms, created_at)"
+                " VALUES (1, 2, 'rate', 4, 1, 0.1, 0.2, 1, 800, ?)", (AT,))  # fmt: skip
+            put("INSERT INTO events (clip_id, rater_id, kind, reason, snapshot, latency_ms, created_at)"
+                " VALUES (5, 2, 'skip', 'too dark', 1, 700, ?)", (AT,))  # fmt: skip
+            put("INSERT INTO events (rater_id, kind, snapshot, latency_ms, run, by_id, created_at)"
+                " VALUES (3, 'leave out', 1, 0, 'hop-1', 1, ?)", (AT,))  # fmt: skip
+        if version >= 4:
+            put("INSERT INTO pairs (run, demo_step, steps, stage, iteration, left_segment, right_segment,"
+                " state, created_at) VALUES ('hop-1', 20, 4, 'online', 1, ?, ?, 'ready', ?)",
+                (packed(7, version), packed(8, version), AT))  # fmt: skip
+            put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
+                " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
+        if version >= 5:
+            put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
+            put("INSERT INTO audit (at, who, what, detail) VALUES (?, 'ada', 'came in', 'link 1')", (AT,))
+        put("VACUUM")
+
+
+if __name__ == "__main__":
+    for number in range(1, len(STEPS) + 1):
+        if not (HERE / f"v{number}.sqlite3").exists():
+            make(number, HERE / f"v{number}.sqlite3")
