@@ -15,8 +15,7 @@ from trainer.config import RunConfig
 from trainer.errors import UserError
 from trainer.learner import Learner
 from trainer.predictor import Snapshot
-from trainer.records import Clip, Segment
-from trainer.rollouts import Transitions
+from trainer.records import Clip, Rollouts, Segment
 from trainer.store import NewClip, Store
 
 _FULL = 2 / 3
@@ -73,19 +72,23 @@ class Asking:
         """Ratings that hold and are learned from."""
         return self._store.count_learned(self._run)
 
-    def fill(self, learner: Learner, pool: Transitions | None, snapshot: Snapshot | None) -> None:
+    def fill(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> None:
         """Cuts clips; in place of those that a simulated rater declines it cuts others.
 
         Args:
             learner: Chooses.
-            pool: What clips are cut from; None if there are no rollouts yet (a resumed run: the first
-                iteration brings them).
+            pool: What clips are cut from; None if none are at hand (a run that went on with all its
+                questions answered).
             snapshot: Predicts; None before the first fit.
 
         Raises:
             UserError: If a simulated rater declines whatever the random policy does.
         """
         self._declined = 0
+        if self._simulated is not None:
+            # A process before this one may have died between its questions and the answers.
+            asked = [c for s in ("cut", "ready") for c in self._store.waiting_clips(self._run, s)]
+            self._answer(self._simulated, learner, asked, [self._store.segment(c.id) for c in asked])
         while self._fill_once(learner, pool, snapshot):
             if self._declined >= _MOST_DECLINED:
                 if learner.iteration == 0 and self._simulated is not None:
@@ -108,7 +111,7 @@ class Asking:
         stale = [c.id for c in self._store.waiting_clips(self._run) if c.iteration < oldest]
         self._store.set_clip_state(stale, "withdrawn")
 
-    def _fill_once(self, learner: Learner, pool: Transitions | None, snapshot: Snapshot | None) -> bool:
+    def _fill_once(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> bool:
         """Cuts as many clips as are missing from the queue; True if some still are.
 
         A few at a time, because one alone cannot be a mix of kinds (``trainer/choice.py``). While the
@@ -145,7 +148,9 @@ class Asking:
         clips = self._store.add_clips(self._run, new)
         if self.clips is not None:
             self.clips.submit(clips)
-        return self._simulated is not None and self._answer(self._simulated, learner, clips, new)
+        return self._simulated is not None and self._answer(
+            self._simulated, learner, clips, [clip.segment for clip in new]
+        )
 
     def _missing(self, learner: Learner, snapshot: Snapshot | None) -> int:
         # Waiting is read before given, so that a press in between is missing from neither.
@@ -156,13 +161,15 @@ class Asking:
         queue = min(self._config.ratings.queue, self.target - given)
         return queue - len(waiting) if len(waiting) <= _FULL * queue else 0
 
-    def _answer(self, simulated: Simulated, learner: Learner, clips: list[Clip], cut: list[NewClip]) -> bool:
-        """Has fresh clips rated by the simulated rater; whether it declined any."""
+    def _answer(
+        self, simulated: Simulated, learner: Learner, clips: list[Clip], segments: list[Segment]
+    ) -> bool:
+        """Has clips rated by the simulated rater; whether it declined any."""
         rater, declined = self._store.ensure_rater(simulated.name, "simulated"), False
-        for clip, new in zip(clips, cut, strict=True):
-            value = simulated.rate(new.segment, clip.demo_step)
+        for clip, segment in zip(clips, segments, strict=True):
+            value = simulated.rate(segment, clip.demo_step)
             if value is not None:
-                mark = simulated.mark(new.segment, clip.demo_step) if simulated.mark else None
+                mark = simulated.mark(segment, clip.demo_step) if simulated.mark else None
                 seconds = (mark[0] * learner.dt, mark[1] * learner.dt) if mark else None
                 self._store.rate(clip.id, rater.id, value, latency_ms=0, mark=seconds)
                 self._declined = 0

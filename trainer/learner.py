@@ -23,7 +23,7 @@ from trainer.imagined import track_basis
 from trainer.policy import Policy, PolicySnapshot, check_device
 from trainer.practice import PracticeRules, fill_bank
 from trainer.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
-from trainer.records import Segment
+from trainer.records import Rollouts, Segment
 from trainer.rollouts import Collector, EpisodeRules, Transitions
 from trainer.starts import wild_rollouts
 from trainer.store import RatedSegment
@@ -150,7 +150,7 @@ class Learner:
         )
 
     def choose(
-        self, rollouts: Transitions, snapshot: Snapshot | None, count: int, rng: np.random.Generator
+        self, rollouts: Rollouts, snapshot: Snapshot | None, count: int, rng: np.random.Generator
     ) -> list[Question]:
         """Chooses clips of rollouts to be rated, by the run's settings (``trainer/choice.py``)."""
         config = self.config.ratings

@@ -8,7 +8,6 @@ and clips of the last rollouts go on being cut, so that rating goes on.
 
 from __future__ import annotations
 
-import io
 import logging
 import threading
 import time
@@ -24,19 +23,19 @@ from trainer import envs, gallery
 from trainer.appearance import Track
 from trainer.appearance import learn as learn_appearance
 from trainer.asking import Asking, Simulated
+from trainer.checkpoint import load_checkpoint, save_checkpoint
 from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
 from trainer.encoders import Encoder, demo_features
 from trainer.errors import UserError
-from trainer.files import write_atomic
 from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.pairing import Pairing
 from trainer.policy import PolicySnapshot
 from trainer.predictor import Snapshot
 from trainer.priority import give_way
-from trainer.records import Demo, Status
+from trainer.records import Demo, Rollouts, Status
 from trainer.render import RenderThread
 from trainer.rollouts import Acting, EpisodeRules, Transitions
 from trainer.store import Store
@@ -103,7 +102,7 @@ class Trainer:
             self._gallery = gallery.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
         self._asking = Asking(store, run, config, simulated)
         self._training_set = TrainingSet(store, run, self.dt)
-        self._pool: Transitions | None = None
+        self._pool: Rollouts | None = None
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
@@ -331,9 +330,8 @@ class Trainer:
         stats["steps_per_s"] = (learner.env_steps - before) / self._work_s
         self._pool, self._policy = rollouts, learner.policy()
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
-        buffer = io.BytesIO()
-        torch.save({"learner": learner.state_dict(), "row": row}, buffer)
-        write_atomic(self.directory / "checkpoint.pt", buffer.getvalue())
+        left = self._asking.given() < self._asking.target
+        save_checkpoint(self._checkpoint, learner.state_dict(), row, rollouts if left else None)
         self.store.add_iteration(self.run, learner.iteration, **row)
         self._asking.withdraw_stale(learner.iteration)
         if self._watch is not None:
@@ -406,12 +404,16 @@ class Trainer:
                 self._fitted_event = row["last_event"]
                 return
 
+    @property
+    def _checkpoint(self) -> Path:
+        return self.directory / "checkpoint.pt"
+
     def _load_checkpoint(self, learner: Learner) -> bool:
-        file = self.directory / "checkpoint.pt"
-        if not file.exists():
+        saved = load_checkpoint(self._checkpoint)
+        if saved is None:
             return False
-        saved = torch.load(file, weights_only=True, map_location="cpu")
-        learner.load_state_dict(saved["learner"])
+        state, row, self._pool = saved
+        learner.load_state_dict(state)
         # The process may have died between the file and the row.
-        self.store.add_iteration(self.run, learner.iteration, **saved["row"])
+        self.store.add_iteration(self.run, learner.iteration, **row)
         return True

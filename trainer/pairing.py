@@ -19,7 +19,6 @@ from trainer.learner import Learner
 from trainer.pairs import NewPair, Pair
 from trainer.records import Rollouts
 from trainer.render import Renderer, RenderThread
-from trainer.rollouts import Transitions
 from trainer.store import Store
 
 log = logging.getLogger("onedemo")
@@ -60,7 +59,7 @@ class Pairing:
         """The picture of a pair: demo, left, right; it is there once the pair is "ready"."""
         return self._directory / f"{pair_id:06d}.jpg"
 
-    def fill(self, learner: Learner, pool: Transitions | None) -> None:
+    def fill(self, learner: Learner, pool: Rollouts | None) -> None:
         """Cuts what is missing from the queue, if somebody looks, and has it drawn."""
         if pool is None or time.monotonic() > self._wanted_until:
             return

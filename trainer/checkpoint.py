@@ -1,0 +1,65 @@
+"""Where a training was after an iteration: one file, replaced whole.
+
+It holds what the learner is, the iteration's row in the database, and while there are questions left the
+rollouts that they are cut from: a training that was killed asks what it would have asked.
+
+Shapes: N lanes, T control steps.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from trainer.files import write_atomic
+from trainer.records import Rollouts
+
+_UNSEEN = ("inputs", "next_inputs")
+"""What no clip is cut from, the larger part: left out."""
+
+
+def save_checkpoint(file: Path, learner: dict[str, Any], row: dict[str, Any], pool: Rollouts | None) -> None:
+    """Writes a checkpoint.
+
+    Args:
+        file: Where.
+        learner: ``Learner.state_dict``.
+        row: What ``Store.add_iteration`` is told.
+        pool: Rollouts that clips are still cut from, (N, T); None if nobody is asked any more.
+
+    Raises:
+        OSError: If it cannot be written; the one before is then untouched.
+    """
+    buffer = io.BytesIO()
+    torch.save({"learner": learner, "row": row, "pool": _pack(pool) if pool is not None else None}, buffer)
+    write_atomic(file, buffer.getvalue())
+
+
+def load_checkpoint(file: Path) -> tuple[dict[str, Any], dict[str, Any], Rollouts | None] | None:
+    """What ``save_checkpoint`` was given; None if there is no such file.
+
+    The pool's policy inputs have width 0. Checkpoints of before pools were kept have none.
+    """
+    if not file.exists():
+        return None
+    saved = torch.load(file, weights_only=True, map_location="cpu")
+    pool = saved.get("pool")
+    return saved["learner"], saved["row"], _unpack(pool) if pool is not None else None
+
+
+def _pack(pool: Rollouts) -> dict[str, torch.Tensor]:
+    # Time first, as they lie in memory; copied, because a view would be saved with all that it is cut from.
+    packed = {}
+    for field in fields(Rollouts):
+        value = getattr(pool, field.name)
+        value = value[..., :0] if field.name in _UNSEEN else value
+        packed[field.name] = torch.from_numpy(value.swapaxes(0, 1).copy())
+    return packed
+
+
+def _unpack(packed: dict[str, torch.Tensor]) -> Rollouts:
+    return Rollouts(**{name: value.numpy().swapaxes(0, 1) for name, value in packed.items()})
