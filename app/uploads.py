@@ -1,0 +1,123 @@
+"""A video that a researcher sends over HTTP becomes a demo.
+
+It is streamed to a file under a name of our own, decoded by a limited child (``trainer.guarded``) and
+added exactly as ``onedemo demo add`` does. Whatever happens, the file is gone afterwards.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import tempfile
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from aiohttp import BodyPartReader, web
+
+from trainer.demos import import_video
+from trainer.errors import UserError
+
+LARGEST = 500 << 20
+"""Bytes of a video."""
+LONGEST_SECONDS = 600.0
+"""Until a video has arrived."""
+MOST_AT_ONCE = 2
+"""Uploads, with their decoding."""
+_LONGEST_FIELD = 200
+_FIELDS = ("name", "start", "end", "mirror")
+
+
+class Uploads:
+    """Takes in videos.
+
+    Args:
+        data_dir: Where the demos are; what an earlier process left of its uploads is removed.
+        largest: Bytes of a video.
+        longest: Seconds until it has arrived.
+    """
+
+    def __init__(self, data_dir: Path, *, largest: int = LARGEST, longest: float = LONGEST_SECONDS) -> None:
+        self._demos_dir, self._place = data_dir / "demos", data_dir / "uploads"
+        self._largest, self._longest = largest, longest
+        self._open = 0
+        for left in self._place.glob("upload-*"):
+            left.unlink(missing_ok=True)
+
+    async def add(self, request: web.Request) -> web.Response:
+        """Answers a form with ``name``, if wanted ``start``, ``end``, ``mirror``, and last of all ``video``.
+
+        The answer is one sentence: what the demo is now, or what was wrong.
+        """
+        if self._open >= MOST_AT_ONCE:
+            raise web.HTTPServiceUnavailable(text="Other videos are being uploaded; try again in a minute.")
+        self._open += 1
+        path = None
+        try:
+            self._place.mkdir(parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=self._place, prefix="upload-")
+            path = Path(name)
+            with os.fdopen(handle, "wb") as file:
+                async with asyncio.timeout(self._longest):
+                    fields = await self._receive(request, file)
+            demo = await asyncio.to_thread(
+                partial(import_video, path, demos_dir=self._demos_dir, source="uploaded", **_options(fields))
+            )
+        except TimeoutError:
+            raise web.HTTPRequestTimeout(
+                text=f"The video did not arrive within {self._longest:g} s; send a shorter one."
+            ) from None
+        except (UserError, ValueError) as error:
+            said = str(error).replace(str(path), "the video").replace("--", "")
+            raise web.HTTPBadRequest(text=f"{said[:1].upper()}{said[1:]}.") from None
+        except OSError as error:
+            raise web.HTTPInsufficientStorage(
+                text=f"The video could not be stored ({error.strerror or error})."
+            ) from None
+        finally:
+            self._open -= 1
+            if path is not None:
+                with suppress(OSError):
+                    path.unlink()
+        return web.Response(text=f"{demo.name} is a demo now: {demo.seconds:.1f} s, {demo.frames} frames.")
+
+    async def _receive(self, request: web.Request, file: Any) -> dict[str, str]:
+        """Writes the video to the file; returns the other fields. The file's own name is not looked at."""
+        if not request.content_type.startswith("multipart/form-data"):
+            raise ValueError("an upload is a form with a name and a video")
+        fields: dict[str, str] = {}
+        parts = await request.multipart()
+        while (part := await parts.next()) is not None:
+            if not isinstance(part, BodyPartReader):
+                break
+            if part.name == "video":
+                size = 0
+                while chunk := await part.read_chunk(1 << 16):
+                    size += len(chunk)
+                    if size > self._largest:
+                        raise ValueError(
+                            f"the video is larger than {self._largest / 2**20:g} MB; scale it down"
+                        )
+                    await asyncio.to_thread(file.write, chunk)
+                return fields
+            if part.name not in _FIELDS or part.name in fields:
+                break
+            text = await part.read_chunk(_LONGEST_FIELD + 1)
+            if len(text) > _LONGEST_FIELD or await part.read_chunk(1):
+                raise ValueError(f"{part.name} is up to {_LONGEST_FIELD} characters")
+            fields[part.name] = text.decode("utf-8", "replace").strip()
+        raise ValueError(f"an upload has the fields {', '.join(_FIELDS)} and, as the last, video")
+
+
+def _options(fields: dict[str, str]) -> dict[str, Any]:
+    times = {}
+    for name in ("start", "end"):
+        try:
+            times[name] = float(fields[name]) if fields.get(name) else None
+        except ValueError:
+            times[name] = math.nan
+        if times[name] is not None and not math.isfinite(times[name]):
+            raise ValueError(f"{name} is a number of seconds")
+    return {"name": fields.get("name", ""), "mirror": fields.get("mirror") == "on", **times}
