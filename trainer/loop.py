@@ -2,8 +2,8 @@
 
 The way of one rating: it is in the database -> before the next iteration this thread sees a new event
 -> refit -> snapshot N on disk and in the database -> N scores the whole iteration -> TRPO step ->
-checkpoint -> new clips are cut from the newest rollouts. If anything fails, the error is in ``status``
-and clips of the last rollouts go on being cut, so that rating goes on.
+checkpoint -> new clips are cut from the newest rollouts. If anything fails, the error is in ``status``,
+clips of the last rollouts go on being cut, so that rating goes on, and after a while it is tried again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
 from trainer.encoders import Encoder, demo_features
-from trainer.errors import UserError
+from trainer.errors import in_words
 from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.pairing import Pairing
@@ -48,6 +48,10 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
+
+
+_REST_S = (5.0, 300.0)
+"""Before the first try after a failure, and at most: each rest is twice as long as the one before."""
 
 
 class _Stopped(Exception):
@@ -106,6 +110,7 @@ class Trainer:
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
         self._retry = threading.Event()
+        self._rest_s = _REST_S[0]
         self._retired = False
         self._control = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -212,7 +217,7 @@ class Trainer:
         self.work()
 
     def work(self) -> None:
-        """Runs until done or stopped; a failure is shown in ``status`` and can be retried."""
+        """Runs until done or stopped; a failure is shown in ``status`` and tried again."""
         while not self._stop.is_set():
             try:
                 self._work()
@@ -334,6 +339,7 @@ class Trainer:
         save_checkpoint(self._checkpoint, learner.state_dict(), row, rollouts if left else None)
         self.store.add_iteration(self.run, learner.iteration, **row)
         self._asking.withdraw_stale(learner.iteration)
+        self._rest_s = _REST_S[0]
         if self._watch is not None:
             self._watch(learner, snapshot)
         self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
@@ -365,12 +371,15 @@ class Trainer:
         return {"true_reward": float(reward.mean() * self._learner.demo_steps)}
 
     def _rest_after(self, error: Exception) -> None:
-        """Shows a failure and keeps cutting clips, until told to try again or to stop."""
-        reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-        self._tell("failed", "The robot has stopped practising. Your ratings are kept, and still count.")
-        self._status = replace(self._status, error=reason)
+        """Shows a failure and keeps cutting clips, until it is time or somebody says to try again."""
+        self._tell(
+            "failed",
+            "The robot has stopped practising, and soon tries again. Your ratings are kept, and still count.",
+        )
+        self._status = replace(self._status, error=in_words(error))
+        until, self._rest_s = time.monotonic() + self._rest_s, min(2 * self._rest_s, _REST_S[1])
         self._retry.clear()
-        while not (self._stop.is_set() or self._retry.wait(_TICK_S)):
+        while not (self._stop.is_set() or self._retry.wait(_TICK_S) or time.monotonic() > until):
             try:
                 if self._learner is not None:
                     self._ask(self._learner)
