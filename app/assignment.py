@@ -29,11 +29,25 @@ class Ask:
     clip: int
     kind: str = "fresh"
     """"fresh", or asked again: "shared" (others have rated it), "repeated" (the same person has)."""
+    mark: tuple[int, int] | None = None
+    """Once it is answered: where it was said to go wrong, first picture and picture after the last."""
 
     @property
     def repeat(self) -> bool:
         """Whether the answer is a second opinion."""
         return self.kind == "repeated"
+
+
+@dataclass(frozen=True, slots=True)
+class Seat:
+    """One page of one person."""
+
+    rater: int
+    page: Hashable
+
+
+def _same_person(one: Hashable, other: Hashable) -> bool:
+    return isinstance(one, Seat) and isinstance(other, Seat) and one.rater == other.rater
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +114,14 @@ class Assignment:
     ) -> int | None:
         """Leases the first clip to a page that is free, or the page's own already.
 
+        If there is none, one that another page of the same person holds: it may be gone without a word, as
+        when a line breaks, and nobody should wait for themselves.
+
         A lease that the page has already runs on as it was, so an open page that nobody sits at
         does not keep a clip from others.
 
         Args:
-            holder: The page that asks.
+            holder: The page that asks: a ``Seat``, or anything else for a page that is nobody else's.
             clips: To choose from, best first.
             now: Seconds, on the clock of the leases.
             avoid: Clips this page has dealt with, or has in hand.
@@ -113,15 +130,22 @@ class Assignment:
             The clip, or None if there is none.
         """
         with self._lock:
+            mine = None
             for clip in clips:
                 lease = self._leases.get(clip)
                 own = lease is not None and lease.holder == holder
-                if clip in avoid or not (lease is None or own or lease.until <= now):
+                if clip in avoid:
+                    continue
+                if not (lease is None or own or lease.until <= now):
+                    if mine is None and _same_person(lease.holder, holder):
+                        mine = clip
                     continue
                 if not own:
                     self._leases[clip] = Lease(holder, now + self.lease_seconds)
                 return clip
-            return None
+            if mine is not None:
+                self._leases[mine] = Lease(holder, now + self.lease_seconds)
+            return mine
 
     def hold(self, holder: Hashable, clip: int, *, now: float) -> None:
         """Leases a clip to a page from now on, whoever held it: it is on that page's screen now."""

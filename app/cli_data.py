@@ -26,6 +26,7 @@ def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentPar
     export.add_argument("--rater", metavar="NAME", help="only this rater (of the CSV)")
     export.add_argument("--segments", type=Path, metavar="FILE", help="states and actions behind the clips")
     export.add_argument("--comparisons", type=Path, metavar="FILE", help="answers about pairs, as CSV")
+    export.add_argument("--skips", type=Path, metavar="FILE", help="skipped clips and why, as CSV")
     export.add_argument("--card", type=Path, metavar="FILE", help="the data card, in Markdown")
 
     back = command(commands, "import", _import, "an export back into an empty data directory")
@@ -51,6 +52,7 @@ def check_output(file: Path, data_dir: Path) -> None:
 def _export(arguments: argparse.Namespace) -> None:
     from app.card import card
     from app.exports import csv_blocks, write_parquet
+    from trainer.answers import SKIP_COLUMNS
     from trainer.files import write_atomic
     from trainer.pairs import COMPARISON_COLUMNS
 
@@ -58,7 +60,7 @@ def _export(arguments: argparse.Namespace) -> None:
         run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
-        others = (arguments.segments, arguments.comparisons, arguments.card)
+        others = (arguments.segments, arguments.comparisons, arguments.skips, arguments.card)
         for file in (arguments.out, *others):
             if file is not None:
                 check_output(file, arguments.data_dir)
@@ -68,6 +70,8 @@ def _export(arguments: argparse.Namespace) -> None:
             write_atomic(arguments.card, card(store, run).encode())
         if arguments.comparisons is not None:
             write_atomic(arguments.comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
+        if arguments.skips is not None:
+            write_atomic(arguments.skips, csv_blocks(store.iter_skips(run), SKIP_COLUMNS))
         blocks = csv_blocks(store.iter_ratings(run, rater=arguments.rater))
         if arguments.out is not None:
             write_atomic(arguments.out, blocks)

@@ -44,6 +44,24 @@ SEGMENTS: dict[str, str] = {
 """Of the Parquet file, in order; the last four are lists of rows."""
 
 
+SKIPS: dict[str, str] = {
+    "id": "Number of the skip, among those of the ratings; ascending in time.",
+    "clip_id": "Clip that was not rated.",
+    "run": "Training that the clip belongs to.",
+    "demo": "Name of the demonstration video.",
+    "rater": "Name of the rater.",
+    "reason": "Why, in the rater’s words; empty: not said.",
+    "stage": "pretrain: random motion; online: the policy in training.",
+    "iteration": "Iteration of the policy whose motion the clip shows; 0 in pretrain.",
+    "created_at": "When it was skipped, or the reason given: UTC, ISO 8601, milliseconds.",
+    "latency_ms": "From the clip on screen to the press, milliseconds.",
+    "demo_step": "Control step of the demonstration at which the clip begins.",
+    "steps": "Length of the clip, control steps.",
+    "repeat": "1: it was the same person’s second look; else 0.",
+}
+"""Of the CSV of skips, in order."""
+
+
 COMPARISONS: dict[str, str] = {
     "id": "Number of the answer; ascending in time.",
     "pair_id": "Pair of clips.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,8 @@ from urllib.parse import quote
 
 from app.charts import classes_html
 from app.quality import Quality, quality, quality_by_rater, rating_rows
-from app.words import ANSWERS
+from app.words import ANSWERS, nobody_html
+from trainer.answers import SKIP_COLUMNS
 from trainer.records import Rater, Status
 
 if TYPE_CHECKING:
@@ -64,10 +66,11 @@ class Data:
         try:
             store, run = self._trainer.store, self._trainer.run
             rows = rating_rows(store, run)
+            skips = Counter(row[SKIP_COLUMNS.index("rater")] for row in store.iter_skips(run))
             people = {rater.name: rater for rater in store.raters()}
             self._html.content = data_html(
-                run, method, store.tallies(run), quality(rows), quality_by_rater(rows), people,
-                store.left_out(run),
+                run, method, store.tallies(run), quality(rows), quality_by_rater(rows, raters=skips), skips,
+                people, store.left_out(run),
             )  # fmt: skip
             self._counted, self._counted_at = event, time.monotonic()
         except Exception:
@@ -78,7 +81,7 @@ class Data:
 
 def data_html(
     run: str, method: str, counts: Mapping[tuple[str, str], list[int]], whole: Quality,
-    each: Mapping[str, Quality], people: Mapping[str, Rater], left_out: set[int],
+    each: Mapping[str, Quality], skips: Mapping[str, int], people: Mapping[str, Rater], left_out: set[int],
 ) -> str:  # fmt: skip
     """The tab's figures.
 
@@ -88,17 +91,20 @@ def data_html(
         counts: As ``Store.tallies``.
         whole: Quality of all ratings.
         each: Of each rater's, by name.
+        skips: Clips that each skipped, by name.
         people: Raters by name.
         left_out: Raters whose ratings nothing learns from.
     """
     classes = [sum(row[value] for row in counts.values()) for value in range(5)]
     total = sum(classes)
+    learned = sum(sum(row) for (name, _), row in counts.items() if people[name].id not in left_out)
     where = f"in run <b>{escape(run)}</b>, method <b>{escape(method)}</b>"
     return (
         '<article class="od-data"><div class="od-data-top"><div><h1>Ratings</h1>'
         f"<p>{total} rating{'' if total == 1 else 's'} {where}</p></div></div>"
+        f"{nobody_html(total, learned)}"
         f"{_summary(whole)}{classes_html(classes)}"
-        f"<section><h3>By rater</h3>{_raters_table(each, people, left_out)}</section>"
+        f"<section><h3>By rater</h3>{_raters_table(each, skips, people, left_out)}</section>"
         f"<section><h3>By rater and stage</h3>{_stages_table(counts)}</section></article>"
     )
 
@@ -129,12 +135,15 @@ def _steady(figures: Quality) -> tuple[str, str]:
     return f"{100 * figures.same:.0f} %", f"of {figures.repeats} clips; {figures.apart:.1f} points apart"
 
 
-def _raters_table(each: Mapping[str, Quality], people: Mapping[str, Rater], left_out: set[int]) -> str:
+def _raters_table(
+    each: Mapping[str, Quality], skips: Mapping[str, int], people: Mapping[str, Rater], left_out: set[int]
+) -> str:
     if not each:
         return '<p class="od-quiet">Nobody has rated yet. The table fills as ratings come in.</p>'
-    heads = ("Rater", "Ratings", "1 to 5", "Agreement", "Second look", "Median time", "Drift", "")
+    heads = ("Rater", "Ratings", "Skipped", "1 to 5", "Agreement", "Second look", "Median time", "Drift", "")
     rows = "".join(
-        _rater_row(people[name], figures, people[name].id in left_out) for name, figures in each.items()
+        _rater_row(people[name], figures, skips.get(name, 0), people[name].id in left_out)
+        for name, figures in each.items()
     )
     head = "".join(f'<th scope="col">{name}</th>' for name in heads)
     return (
@@ -145,7 +154,7 @@ def _raters_table(each: Mapping[str, Quality], people: Mapping[str, Rater], left
     )
 
 
-def _rater_row(rater: Rater, figures: Quality, left_out: bool) -> str:
+def _rater_row(rater: Rater, figures: Quality, skipped: int, left_out: bool) -> str:
     most = max(max(figures.shares), 1e-9)
     bars = "".join(f'<i style="height:{max(4, 100 * share / most):.0f}%"></i>' for share in figures.shares)
     shares = ", ".join(f"{100 * share:.0f} % {value}" for value, share in enumerate(figures.shares, 1))
@@ -157,7 +166,7 @@ def _rater_row(rater: Rater, figures: Quality, left_out: bool) -> str:
     bars = f'<span class="od-bars" role="img" aria-label="{shares}">{bars}</span>'
     return (
         f'<tr{" class=od-left-out" if left_out else ""}><th scope="row">{escape(rater.name)}{warned}</th>'
-        f"<td>{figures.ratings}</td><td>{bars}</td>"
+        f"<td>{figures.ratings}</td><td>{skipped}</td><td>{bars}</td>"
         f"<td>{'–' if alpha is None else f'{alpha:.2f}'}</td><td>{_steady(figures)[0]}</td>"
         f"<td>{_number(figures.seconds, 's')}</td><td>{_number(figures.drift, '', sign=True)}</td>"
         f"<td>{button}</td></tr>"
@@ -206,6 +215,7 @@ def export_html(run: str, path: str) -> str:
         "Segments (Parquet)</a>"
         f'<a class="od-button" href="/comparisons.csv{query}" data-of-run="/comparisons.csv" download>'
         "Comparisons (CSV)</a>"
+        f'<a class="od-button" href="/skips.csv{query}" data-of-run="/skips.csv" download>Skips (CSV)</a>'
         f'<a class="od-button" href="/card.md{query}" data-of-run="/card.md" download>Data card</a></div>'
         "<p class=od-quiet>The CSV has one header, times in UTC, formula-like cells made harmless. The "
         "segments are the states and actions behind the clips. <code>onedemo import</code> reads both "

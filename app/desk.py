@@ -7,13 +7,14 @@ desk moves on; if the commit fails the clip stays.
 
 from __future__ import annotations
 
-import math
 import random
 import threading
 import time
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 
-from app.assignment import Ask, Assignment, to_repeat, to_share
+from app.assignment import Ask, Assignment, Seat, to_repeat, to_share
+from trainer.marks import seconds_of_pictures
 from trainer.records import Rater
 from trainer.store import Store
 
@@ -21,7 +22,7 @@ GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
 
 Mark = tuple[float, float]
-"""Where a clip goes wrong: from, to, seconds from its start."""
+"""Where a clip goes wrong: its first picture, and the picture after the last; whole numbers."""
 
 
 class Desk:
@@ -34,6 +35,8 @@ class Desk:
         assignment: Shared by all pages of the run.
         holder: Names this page to the assignment.
         dt: Seconds of a control step.
+        fps: Pictures per second of the demo.
+        frames: Pictures of the demo.
         done: What was rated or skipped here before, to be taken back: a page that is loaded again goes on.
         clock: Seconds; replaced in tests.
         rng: Draws which clips are asked again.
@@ -48,6 +51,8 @@ class Desk:
         holder: Hashable,
         *,
         dt: float,
+        fps: float,
+        frames: int,
         done: list[Ask] | None = None,
         clock: Callable[[], float] = time.monotonic,
         rng: random.Random | None = None,
@@ -56,8 +61,8 @@ class Desk:
         self._run = run
         self.rater = rater
         self._assignment = assignment
-        self._holder = holder
-        self._dt = dt
+        self._holder = Seat(rater.id, holder)
+        self._dt, self._fps, self._frames = dt, fps, frames
         self._clock = clock
         self._rng = rng or random.Random()
         self._lock = threading.RLock()
@@ -66,7 +71,7 @@ class Desk:
         self._kind = self._assignment.again.draw(self._rng)
         self._current: Ask | None = None
         self._upcoming: Ask | None = None
-        self.mark: Mark | None = None
+        self.mark: tuple[int, int] | None = None
         """Where the clip on screen goes wrong, as far as said."""
         self.skipped: int | None = None
         """The clip that was skipped last, as long as its reason may still be said."""
@@ -109,10 +114,9 @@ class Desk:
             ask = self._accepted(clip)
             if ask is None:
                 return False
-            self._store.rate(
-                clip, self.rater.id, value, self._latency_ms(), mark=self.mark, repeat=ask.repeat
-            )
-            self._leave(ask)
+            seconds = self._seconds(clip, self.mark) if self.mark is not None else None
+            self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=seconds, repeat=ask.repeat)
+            self._leave(replace(ask, mark=self.mark))
             return True
 
     def skip(self, clip: int) -> bool:
@@ -152,15 +156,20 @@ class Desk:
         with self._lock:
             if clip != self.current:
                 return False
-            if mark is not None:
-                shown = self._store.clip(clip)
-                length = shown.steps * self._dt if shown is not None else 0.0
-                start, end = max(0.0, mark[0]), min(length, mark[1])
-                if not (start < end and all(map(math.isfinite, mark))):
-                    raise ValueError(f"a mark is a stretch of the clip, 0 to {length:.2f} s, got {mark}")
-                mark = round(start, 3), round(end, 3)
-            self.mark = mark
+            if mark is None:
+                self.mark = None
+                return True
+            self._seconds(clip, mark)  # or it is no stretch of this clip
+            self.mark = int(mark[0]), int(mark[1])
             return True
+
+    def _seconds(self, clip: int, mark: Mark) -> tuple[float, float]:
+        shown = self._store.clip(clip)
+        if shown is None:
+            raise ValueError(f"no clip {clip}")
+        return seconds_of_pictures(
+            mark, shown.demo_step, shown.steps, dt=self._dt, fps=self._fps, frames=self._frames
+        )
 
     def undo(self) -> bool:
         """Takes the last rating or skip back and shows its clip again.
@@ -180,7 +189,8 @@ class Desk:
             if self._upcoming is not None and self._current is not None:
                 self._assignment.release(self._holder, self._upcoming.clip)
             self._upcoming = self._current or self._upcoming
-            self._show(ask)
+            self._show(replace(ask, mark=None))
+            self.mark = ask.mark  # it is seen again, and goes with the next rating unless it is cleared
             return True
 
     def close(self) -> None:

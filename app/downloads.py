@@ -16,6 +16,7 @@ from aiohttp import web
 from app import exports
 from app.card import card
 from app.columns import RATINGS
+from trainer.answers import SKIP_COLUMNS
 from trainer.pairs import COMPARISON_COLUMNS
 from trainer.store import Store
 
@@ -46,6 +47,11 @@ class Downloads:
         """The answers about pairs."""
         rows = self._store.iter_comparisons(read_filters(request.query).get("run"))
         return await self._stream(request, "comparisons", exports.csv_blocks(rows, COMPARISON_COLUMNS))
+
+    async def skips(self, request: web.Request) -> web.StreamResponse:
+        """Skipped clips, and why."""
+        rows = self._store.iter_skips(read_filters(request.query).get("run"))
+        return await self._stream(request, "skips", exports.csv_blocks(rows, SKIP_COLUMNS))
 
     async def _stream(
         self, request: web.Request, what: str, blocks: Generator[bytes, None, None]

@@ -121,6 +121,7 @@ class Front:
             Route("GET", r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", "researcher", files.rollout),
             Route("GET", "/export.csv", "researcher", downloads.csv, "took out ratings"),
             Route("GET", "/comparisons.csv", "researcher", downloads.comparisons, "took out comparisons"),
+            Route("GET", "/skips.csv", "researcher", downloads.skips, "took out skips"),
             Route("GET", "/segments.parquet", "researcher", downloads.parquet, "took out segments"),
             Route("GET", "/card.md", "researcher", downloads.card, "took out the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
@@ -218,7 +219,7 @@ class Front:
 
 
 def read_note(body: Any) -> dict[str, Any]:
-    """What a browser says of a clip: ``{"clip": 7, "mark": [0.1, 0.2] or null}`` or ``{"clip", "reason"}``.
+    """What a browser says of a clip: ``{"clip": 7, "mark": [3, 6] or null}`` or ``{"clip", "reason"}``.
 
     Raises:
         ValueError: If it is anything else.

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 
-from app.assignment import Assignment
+from app.assignment import Assignment, Seat
 from app.desk import GUARD_SECONDS
 from trainer.records import Rater
 from trainer.store import Store
@@ -29,7 +29,8 @@ class PairDesk:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._store, self._run, self._rater = store, run, rater
-        self._assignment, self._holder, self._clock = assignment, holder, clock
+        self._assignment, self._clock = assignment, clock
+        self._holder = Seat(rater.id, holder)
         self._lock = threading.RLock()
         self._done: list[int] = []
         self._shown_at = 0.0
@@ -83,6 +84,8 @@ class PairDesk:
                 return False
             self._store.compare(self._done[-1], self._rater.id, "undo", 0)
             pair = self._done.pop()
+            if self.upcoming is not None and self.current is not None:
+                self._assignment.release(self._holder, self.upcoming)
             self.upcoming = self.current or self.upcoming
             self._show(pair)
             return True
@@ -92,13 +95,13 @@ class PairDesk:
         self._assignment.release(self._holder)
 
     def _advance(self) -> None:
-        pair, self.current = self.upcoming, None
-        waiting = {pair.id for pair in self._store.waiting_pairs(self._run)}
-        self._show(pair if pair in waiting else self._pick())
+        ahead, self.current = self.upcoming, None
+        # What was fetched ahead is asked for again: others may have taken or answered it since.
+        self._show(self._pick(only=ahead) or self._pick())
         self.upcoming = self._pick() if self.current is not None else None
 
-    def _pick(self) -> int | None:
-        waiting = [pair.id for pair in self._store.waiting_pairs(self._run)]
+    def _pick(self, only: int | None = None) -> int | None:
+        waiting = [pair.id for pair in self._store.waiting_pairs(self._run) if only in (None, pair.id)]
         avoid = () if self.current is None else (self.current,)
         return self._assignment.take(self._holder, waiting, now=self._clock(), avoid=avoid)
 

@@ -6,7 +6,7 @@ alpha-reliability"): 1 is perfect, 0 is chance. Shapes: n ratings, u clips that 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import NamedTuple
@@ -94,15 +94,18 @@ def quality(rows: Sequence[RatingRow], *, seed: int = 0) -> Quality:
     return _figures(rows, agreement(rows, seed=seed), warnings=[])
 
 
-def quality_by_rater(rows: Sequence[RatingRow], *, seed: int = 0) -> dict[str, Quality]:
+def quality_by_rater(
+    rows: Sequence[RatingRow], *, raters: Iterable[str] = (), seed: int = 0
+) -> dict[str, Quality]:
     """The same of each rater. Agreement is that on the clips which this rater and others have rated.
 
     Args:
         rows: n ratings of everybody, oldest first.
+        raters: More people, of whom there may be no rating.
         seed: Of the bootstrap.
     """
     answer = {}
-    for rater in sorted({row.rater for row in rows}):
+    for rater in sorted({*raters, *(row.rater for row in rows)}):
         own = [row for row in rows if row.rater == rater]
         mine = {row.clip for row in own if not row.repeat}
         shared = agreement([row for row in rows if row.clip in mine], seed=seed)

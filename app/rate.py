@@ -34,13 +34,15 @@ class Rate(Pressing):
         super().__init__(session.client)
         self.desk = Desk(
             trainer.store, trainer.run, session.rater, page.assignment, session.client.client_id,
-            dt=trainer.dt, done=session.done,
+            dt=trainer.dt, fps=trainer.demo.fps, frames=trainer.demo.frames, done=session.done,
         )  # fmt: skip
         page.desks[session.client.client_id] = self.desk
         self._status: Status = trainer.status()
         self._clip_keys: list[Any] = []
         self._undo_keys: list[Any] = []
         self._keys_for: Any = None
+        self._drawn: tuple[int, str] | None = None
+        self._mark: tuple[int, int] | None = None
         gui = session.client.gui
         self._top = gui.add_html("")
         self._stage = gui.add_html("")
@@ -58,7 +60,7 @@ class Rate(Pressing):
     def show(self) -> None:
         """Draws the tab and lets its keys act."""
         with self._lock:
-            self._shown = True
+            self._shown, self._drawn = True, None
             if self._lesson is None:
                 self._attempt(self.desk.refill)
             self._draw()
@@ -100,7 +102,7 @@ class Rate(Pressing):
     # Drawing
 
     def _draw(self) -> None:
-        count = sum(self._store.ratings_by_class(self._run))
+        count = self._store.count_learned(self._run)  # as many as the trainer counts
         with self._client.atomic():  # Clip and keys change together.
             if self._lesson is not None:
                 self._draw_lesson()
@@ -111,10 +113,10 @@ class Rate(Pressing):
         asking = clip is not None
         self._put(self._top, html.top_html(count, self._status.target_ratings, asking=asking))
         if clip is not None:
-            self._put(
-                self._stage,
-                html.clip_html(clip, self._fps, self._problem),
-            )
+            # A mark is drawn by the browser; it is given back whenever the clip is drawn anew.
+            if self._drawn != (clip, self._problem):
+                self._drawn, self._mark = (clip, self._problem), self.desk.mark
+            self._put(self._stage, html.clip_html(clip, self._fps, self._problem, self._mark))
         else:
             self._put(self._stage, html.waiting_html(self._status, count, self._problem))
         self._put(self._tools, html.tools_html(rating=asking, can_undo=self.desk.can_undo))

@@ -29,9 +29,11 @@ def top_html(count: int, target: int, *, asking: bool) -> str:
     )
 
 
-def clip_html(clip: int, fps: float, problem: str) -> str:
-    """The clip and its time bar."""
-    player = player_html(f"/clips/{clip}.jpg", fps, "left", "right", attributes=f'data-clip="{clip}"')
+def clip_html(clip: int, fps: float, problem: str, mark: tuple[int, int] | None = None) -> str:
+    """The clip and its time bar, with what is marked on it: first picture, picture after the last."""
+    marked = f' data-mark="{mark[0]},{mark[1]}"' if mark is not None else ""
+    attributes = f'data-clip="{clip}"{marked}'
+    player = player_html(f"/clips/{clip}.jpg", fps, "left", "right", attributes=attributes)
     return f'<div class="od-clip">{player}{_BAR}</div>{_trouble(problem)}'
 
 

@@ -14,6 +14,7 @@ from mjviser import ViserMujocoScene
 
 from app import charts, progress
 from app.live import Moment
+from app.words import nobody_html
 from trainer.records import Status
 
 if TYPE_CHECKING:
@@ -100,7 +101,9 @@ class Watch:
             if not self._shown:
                 return
             self._practised = status.iteration > 0
-            self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until))
+            store, run = self._trainer.store, self._trainer.run
+            nobody = nobody_html(sum(store.ratings_by_class(run)), store.count_learned(run))
+            self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until) + nobody)
             new = self._trainer.store.iterations(self._trainer.run, after=self._charts.last)
             self._charts.extend(new)
             if new:

@@ -15,6 +15,19 @@ MEANINGS = (
 REASONS = ("I cannot see enough", "It is too short to tell", "The picture is broken")
 """Why a clip may be skipped."""
 
+
+def nobody_html(ratings: int, learned: int) -> str:
+    """For researchers, if there are ratings but all are left out of training: what happens now."""
+    if learned or not ratings:
+        return ""
+    return (
+        '<p class="od-nobody" role="status"><b>Everybody is left out of training.</b> Nothing new is '
+        "learned: the robot goes on practising with the last predictor it has, if it has one, and clips "
+        "go on being asked. Take somebody in again on the Data tab, and the next iteration learns from "
+        "their ratings.</p>"
+    )
+
+
 Keys = tuple[tuple[tuple[str, ...], str], ...]
 """Keys, and what they do."""
 

@@ -49,12 +49,15 @@ const note = (what) => post("note", what);
 
 function noteMark(player) {
   if (!player.clip) return;
-  const mark = player.mark && player.mark.map((frame) => frame / player.fps);
-  const mine = note({ clip: player.clip, mark })
-    .catch((error) => {
-      player.setMark(null);
-      player.say(`The mark could not be kept. ${error.message}`);
-    })
+  const mine = note({ clip: player.clip, mark: player.mark })
+    .then(
+      () => (player.unsent = false),
+      (error) => {
+        // It stays on screen: the next press tries it again, and rates only once it is kept.
+        player.unsent = true;
+        player.say(`Your mark could not be saved (${error.message}). Rate again to try once more, or clear it.`);
+      },
+    )
     .finally(() => {
       if (noting === mine) noting = null;
     });
@@ -111,9 +114,11 @@ window.addEventListener(
     const rating = /^[1-5sS]$/.test(event.key) && !event.altKey;
     const ours = rating || event.key === "u" || event.key === "U" || event.key === "Backspace";
     if (ours && (event.repeat || (rating && !main()?.ready))) return stop(); // no rating of what is not there yet
-    if (rating && noting) {
+    const player = main();
+    if (/^[1-5]$/.test(event.key) && rating && player && (noting || player.unsent)) {
       stop();
-      noting.then(() => press(event.key));
+      if (!noting) noteMark(player);
+      noting.then(() => main() === player && !player.unsent && press(event.key));
       return;
     }
     if (rating) flash(event.key.toLowerCase());

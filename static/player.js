@@ -48,9 +48,11 @@ class Player {
     this.playing = !still.matches;
     this.once = false;
     this.mark = null; // [first frame, frame after the last]
+    this.unsent = false; // whether the server does not know of it
     this.marking = null; // frame at which a mark by key began
     this.drawn = -1;
     picture(this.source);
+    if (element.dataset.mark) this.setMark(element.dataset.mark.split(",").map(Number));
     this.draw();
   }
 

@@ -77,7 +77,7 @@ class StandIn:
         from trainer.clips import compose_clip
 
         new = [
-            NewClip(demo_step=38 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
+            NewClip(demo_step=25 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
             for i in range(count)
         ]
         ids = [clip.id for clip in self.store.add_clips(self.run, new)]
@@ -150,5 +150,6 @@ class StandIn:
 
 
 def _zeros() -> Segment:
+    """41 steps, of which 25 are 6 pictures: a clip from a multiple of 25 on has ten."""
     sizes = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
-    return Segment(**{name: np.zeros((38, size)) for name, size in sizes.items()})
+    return Segment(**{name: np.zeros((41, size)) for name, size in sizes.items()})

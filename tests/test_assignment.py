@@ -100,7 +100,7 @@ def clock():
 def make_desk(store, clock, name="bo", assignment=None, **more):
     assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
     rater = store.ensure_rater(name, "annotator")
-    return Desk(store, "r", rater, assignment, name, dt=0.01, clock=clock, **more)
+    return Desk(store, "r", rater, assignment, name, dt=0.01, fps=100.0, frames=240, clock=clock, **more)
 
 
 @pytest.fixture
@@ -192,15 +192,15 @@ def test_two_raters_never_see_the_same_clip(store, clock):
 
 def test_a_mark_goes_with_the_rating_of_its_clip_alone(desk, store, clock):
     clock.now += 1
-    assert not desk.set_mark(2, (0.0, 0.01))  # not on screen
-    assert desk.set_mark(1, (-1.0, 0.02)) and desk.mark == (0.0, 0.02)
-    for mark in ((0.02, 0.01), (0.03, 9.0), (float("nan"), 0.01), (0.0, float("nan"))):
-        with pytest.raises(ValueError, match=r"0 to 0\.03 s"):  # three steps of a hundredth
+    assert not desk.set_mark(2, (0, 1))  # not on screen
+    assert desk.set_mark(1, (0.0, 2.0)) and desk.mark == (0, 2)
+    for mark in ((2, 1), (2, 9), (-1, 2), (float("nan"), 1), (0, float("nan"))):
+        with pytest.raises(ValueError, match="3 pictures"):
             desk.set_mark(1, mark)
-    assert desk.mark == (0.0, 0.02)
+    assert desk.mark == (0, 2)
     desk.rate(1, 2)
     clock.now += 1
-    desk.set_mark(2, (0.01, 9.0))
+    desk.set_mark(2, (1, 3))
     desk.set_mark(2, None)
     desk.rate(2, 3)
     assert [row[15:17] for row in store.iter_ratings()] == [(0.0, 0.02), (None, None)]

@@ -11,7 +11,7 @@ from worlds import Thumbnail, falling_demo, small_config
 
 from app.card import card
 from app.cli import main
-from app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
+from app.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
 from trainer.asking import Simulated
 from trainer.config import load_config
 from trainer.learner import Learner
@@ -168,5 +168,5 @@ def test_an_export_of_one_rater(study, capfdbinary):
 
 def test_the_documentation_has_the_columns():
     text = (Path(__file__).parents[1] / "docs" / "data.md").read_text()
-    for columns in (RATINGS, SEGMENTS, COMPARISONS):
+    for columns in (RATINGS, SEGMENTS, COMPARISONS, SKIPS):
         assert as_table(columns) in text

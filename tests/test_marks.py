@@ -1,14 +1,17 @@
 """Where a clip goes wrong: what a simulated rater marks, and what a fit makes of it."""
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from trainer.judge import Judge
-from trainer.marks import marked_steps, split_marks
+from trainer.marks import marked_steps, seconds_of_pictures, split_marks
 from trainer.records import Segment
-from trainer.store import RatedSegment
+from trainer.store import NewClip, RatedSegment, Store
+from trainer.timing import frame_of_step
+from trainer.training_set import TrainingSet
 
 W = 20
 
@@ -54,6 +57,37 @@ def test_the_best_stays_the_best_and_a_mark_of_everything_says_nothing():
     parts, _ = split_marks([rated(5, (0, 4)), rated(1, (0, W)), rated(1, (30, 40))], np.zeros((3, W), int))
     assert [p.value for p in parts] == [5, 5, 1, 1]
     assert marked_steps(rated(mark=(18, 40))).sum() == 2
+
+
+@pytest.mark.parametrize("fps", [24.0, 29.97, 30.0, 60.0])
+def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
+    """Wherever the clip begins, through the database and back, as what learns sees it."""
+    dt, steps, frames = 0.008, 38, int(8 * fps)
+    with closing(Store(tmp_path)) as store:
+        store.rows("PRAGMA synchronous = OFF")
+        store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+        rater = store.ensure_rater("Ann", "annotator").id
+        zeros = {name: np.zeros((steps, n)) for name, n in dict(obs=11, actions=3, qpos=6, qvel=6).items()}
+        expected = []
+        for demo_step in (0, 1, 2, 3, 101, 930, 962):
+            shown = frame_of_step(demo_step + np.arange(steps), dt, fps, frames)
+            pictures = np.unique(shown)
+            for i, j in ((0, 1), (2, 5), (len(pictures) - 1, len(pictures)), (0, len(pictures))):
+                clip = NewClip(demo_step=demo_step, segment=Segment(**zeros), stage="online", iteration=1)
+                (clip,) = store.add_clips("r", [clip])
+                mark = seconds_of_pictures((i, j), demo_step, steps, dt=dt, fps=fps, frames=frames)
+                store.rate(clip.id, rater, 2, 900, mark=mark)
+                expected.append(np.isin(shown, pictures[i:j]))
+        ratings = TrainingSet(store, "r", dt).at(store.last_event())
+        assert len(ratings) == len(expected) == 28
+        for rating, inside in zip(ratings, expected, strict=True):
+            assert np.array_equal(marked_steps(rating) > 0, inside)
+
+
+@pytest.mark.parametrize("mark", [(0, 0), (3, 1), (-1, 2), (0, 99), (0.5, 2), (0, float("nan"))])
+def test_what_is_no_stretch_of_pictures_is_no_mark(mark):
+    with pytest.raises(ValueError, match="10 pictures"):
+        seconds_of_pictures(mark, 0, 41, dt=0.008, fps=30.0, frames=240)
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,24 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     assert bo.answer(pairs[1], "equal") and bo.current == pairs[2]
 
 
+def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):
+    clock, assignment = Clock(), Assignment()
+    bo, cy = (store.ensure_rater(name, "annotator") for name in ("bo", "cy"))
+    gone = PairDesk(store, "r", bo, assignment, 1, clock)
+    gone.refill()  # and its line breaks without a word
+    back = PairDesk(store, "r", bo, assignment, 2, clock)
+    other = PairDesk(store, "r", cy, assignment, 3, clock)
+    other.refill()
+    assert (other.current, other.upcoming) == (pairs[2], pairs[3])
+    back.refill()
+    assert (back.current, back.upcoming) == (pairs[0], pairs[1])
+    clock.now += 200
+    late = PairDesk(store, "r", store.ensure_rater("di", "annotator"), assignment, 4, clock)
+    late.refill()
+    assert (late.current, late.upcoming) == (pairs[0], pairs[1])  # the leases have ended
+    assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
+
+
 def test_pairs_are_beside_one_moment_of_the_demo_and_no_clip_is_in_two():
     clock = np.tile(np.arange(200), (16, 1)) + 10 * np.arange(16)[:, None]
     whole = rollouts(clock)

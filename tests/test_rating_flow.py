@@ -105,12 +105,70 @@ def test_a_mark_by_dragging_goes_with_the_rating(chromium, site, viewport):
         page.mouse.up()
         page.wait_for_selector(".od-bar-note >> text=Goes wrong from 0.10 to 0.20 s")
         press_and_wait(page, site, lambda: page.keyboard.press("2"))
-        assert marks_of(site) == [(clip, 2, 0.1, 0.2)]
+        assert marks_of(site) == [(clip, 2, 0.104, 0.2)]  # pictures 3 to 5: steps 13 to 24
         second = shown_clip(page)
         page.mouse.click(box["x"] + 0.75 * box["width"], y)  # a tap shows that moment and marks nothing
         assert frame_of(page) == 7
         press_and_wait(page, site, lambda: page.keyboard.press("5"))
         assert marks_of(site)[1:] == [(second, 5, None, None)]
+
+
+def mark_by_dragging(page, start, end):
+    box = page.locator("[data-track]").bounding_box()
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + start * box["width"], y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + end * box["width"], y, steps=4)
+    page.mouse.up()
+
+
+def test_a_mark_is_there_again_after_another_tab_after_undo_and_on_the_last_picture(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        mark_by_dragging(page, 0.95, 1.2)
+        words = page.wait_for_selector(".od-bar-note >> text=Goes wrong from 0.30 to 0.33 s").inner_text()
+        page.wait_for_timeout(GUARD_MS)
+        page.click('.od-tabs >> text="Guide"')
+        page.wait_for_selector(".od-scale")
+        page.click('.od-tabs >> text="Rate"')
+        shown_clip(page)
+        assert page.locator(".od-bar-note").inner_text() == words
+        assert page.locator(".od-wrong").bounding_box()["width"] > 10
+        press_and_wait(page, site, lambda: page.keyboard.press("2"))
+        shown_clip(page)
+        assert "Goes wrong" not in page.locator(".od-bar-note").inner_text()
+        press_and_wait(page, site, lambda: page.keyboard.press("u"))
+        assert shown_clip(page) == clip and page.locator(".od-bar-note").inner_text() == words
+        press_and_wait(page, site, lambda: page.keyboard.press("1"))
+        assert marks_of(site) == [(clip, 2, 0.304, 0.328), (clip, 1, 0.304, 0.328)]
+
+
+def test_no_rating_goes_without_its_mark(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        page.route("**/note", lambda route: route.abort())
+        mark_by_dragging(page, 0.05, 0.15)
+        page.wait_for_selector(".od-bar-note >> text=could not be saved")
+        assert page.locator(".od-wrong").bounding_box()["width"] > 10  # still there
+        page.keyboard.press("2")
+        page.click('.od-answers [data-key="3"]')
+        page.wait_for_timeout(GUARD_MS)
+        assert site.events() == []
+        page.unroute("**/note")
+        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", clip, 4, "bo")
+        assert marks_of(site) == [(clip, 4, 0.0, 0.072)]
+
+
+def test_a_held_enter_on_a_button_gives_one_rating(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        page.focus('.od-answers [data-key="4"]')
+        for _ in range(40):  # without an up in between: held
+            page.keyboard.down("Enter")
+            page.wait_for_timeout(30)
+        page.keyboard.up("Enter")
+        page.wait_for_timeout(GUARD_MS)
+        assert site.events() == [("rate", clip, 4, "bo")]
 
 
 def test_a_mark_by_keys_and_taking_it_away(chromium, site):
@@ -125,7 +183,7 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
         page.keyboard.press("m")
         page.keyboard.press("3")  # at once: the mark must be there first
         until(site.events)
-        assert marks_of(site) == [(clip, 3, 0.033, 0.133)]
+        assert marks_of(site) == [(clip, 3, 0.04, 0.136)]  # pictures 1 to 3: steps 5 to 16
         shown_clip(page)
         page.keyboard.press("m")
         page.keyboard.press("m")
@@ -243,13 +301,14 @@ def test_notes_of_others_clips_and_hostile_notes_change_nothing(chromium, site):
                 f"{site.url}{path}", data=body, headers={"Origin": site.url}, **options
             ).status
 
-        good = {"clip": clip, "mark": [0.0, 0.1]}
+        good = {"clip": clip, "mark": [0, 3]}
         assert post(good) == 204
         assert post({**good, "clip": clip + 5}) == 409
         assert post({"clip": clip, "reason": "not skipped"}) == 409
         for bad in (
             {}, [], "x", {"clip": clip}, {**good, "more": 1}, {**good, "clip": "1"}, {**good, "clip": True},
             {**good, "mark": [0.1]}, {**good, "mark": ["0", "1"]}, {**good, "mark": [5, 1]},
+            {**good, "mark": [0.5, 1]}, {**good, "mark": [9, 11]}, {**good, "mark": [-1, 2]},
             {"clip": clip, "reason": 7}, {"clip": clip, "reason": ""}, {"clip": clip, "reason": "a\nb"},
         ):  # fmt: skip
             assert post(bad) == 400, bad
@@ -262,4 +321,4 @@ def test_notes_of_others_clips_and_hostile_notes_change_nothing(chromium, site):
         assert nobody.request.post(f"{site.url}{path}", data=good, headers={"Origin": site.url}).status == 401
         nobody.close()
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
-        assert marks_of(site) == [(clip, 3, 0.0, 0.1)]
+        assert marks_of(site) == [(clip, 3, 0.0, 0.104)]

@@ -10,6 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from test_page import DESKTOP, GUARD_MS, PHONE, opened, until
 
+from app.cli import main
+from app.columns import SKIPS
+from trainer.answers import SKIP_COLUMNS
+
 pytestmark = pytest.mark.seam
 
 BOTH = pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
@@ -49,9 +53,44 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site, viewport):
         page.wait_for_selector(".od-left-out >> text=Bob <i>", timeout=20_000)
         assert {rating.value for rating in store.ratings_as_of(run)} == {1, 2, 3, 4, 5}
         assert len(store.ratings_as_of(run)) == 30
-        page.click('[data-do="take in"]')
+        assert page.locator(".od-nobody").count() == 0
+        page.locator("tr", has_text="Ann").first.locator("[data-do]").click()
+        page.wait_for_selector(".od-nobody >> text=Everybody is left out of training.", timeout=20_000)
+        to_tab(page, "Watch")
+        page.wait_for_selector(".od-nobody:visible >> text=goes on practising with the last predictor")
+        assert site.trainer.store.count_learned(run) == 0
+        to_tab(page, "Data")
+        for name in ("Ann", "Bob <i>"):
+            row = page.locator(".od-left-out", has_text=name).locator('[data-do="take in"]')
+            row.click()
+            page.wait_for_selector(f'.od-left-out:has-text("{name}")', state="detached", timeout=20_000)
         until(lambda: store.left_out(run) == set())
+        page.wait_for_selector(".od-nobody", state="detached")
         assert len(store.ratings_as_of(run)) == 60
+
+
+def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_path):
+    store, ids = site.trainer.store, site.trainer.add_clips(3)
+    ann = store.ensure_rater("=Ann", "annotator").id
+    store.skip(ids[0], ann, 700)
+    store.skip(ids[0], ann, 0, reason="It is too short to tell")
+    store.skip(ids[1], ann, 800)
+    store.skip(ids[2], ann, 900)
+    store.undo(ids[2], ann)
+    with opened(chromium, site.links["researcher"]) as page:
+        to_tab(page, "Data")
+        row = page.locator("tr", has_text="=Ann").first
+        row.wait_for(timeout=20_000)
+        assert row.locator("td").all_inner_texts()[:2] == ["0", "2"]
+        text = page.request.get(f"{site.url}/skips.csv?run={site.trainer.run}").text()
+    out = tmp_path / "skips.csv"
+    assert main(["export", "--data-dir", str(store.path.parent), "--skips", str(out)]) == 0
+    assert out.read_text() == text.replace("\r\n", "\n")
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert tuple(rows[0]) == tuple(SKIPS) == SKIP_COLUMNS
+    assert [(int(r["clip_id"]), r["rater"], r["reason"], r["latency_ms"]) for r in rows] == [
+        (ids[0], "'=Ann", "It is too short to tell", "700"), (ids[1], "'=Ann", "", "800"),
+    ]  # fmt: skip
 
 
 @BOTH
@@ -79,7 +118,14 @@ def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, viewport,
         for path in ("/preview?rater[]=x", "/export.csv?value=a", "/export.csv?id=1"):
             assert page.request.get(site.url + path).status == 400
     with opened(chromium, site.links["annotator"], viewport) as page:
-        for path in ("/preview", "/segments.parquet", "/card.md", "/comparisons.csv", "/rollouts/1.jpg"):
+        for path in (
+            "/preview",
+            "/segments.parquet",
+            "/card.md",
+            "/comparisons.csv",
+            "/skips.csv",
+            "/rollouts/1.jpg",
+        ):
             assert page.request.get(site.url + path).status == 403, path
         body = {"do": "leave out", "rater": 1}
         origin = {"Origin": site.url}

@@ -16,6 +16,11 @@ RATING_COLUMNS = (
     "choice", "score", "left_out",
 )  # fmt: skip
 """Columns of the view ``ratings``, in order."""
+SKIP_COLUMNS = (
+    "id", "clip_id", "run", "demo", "rater", "reason", "stage", "iteration", "created_at", "latency_ms",
+    "demo_step", "steps", "repeat",
+)  # fmt: skip
+"""Of a skip, in order."""
 MOST_REASON = 200
 """Characters of the reason for a skip."""
 
@@ -263,6 +268,25 @@ class Answers(Database):
         return self.stream(
             f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE {where} ORDER BY id",
             tuple(chosen.values()),
+        )
+
+    def iter_skips(self, run: str | None = None) -> Iterator[tuple]:
+        """The skips that hold, in order of their number, streamed: values of ``SKIP_COLUMNS``.
+
+        A reason that was said afterwards takes the place of the skip; the time is that of the first press.
+        """
+        return self.stream(
+            "SELECT e.id, e.clip_id, c.run, r.demo, p.name, e.reason, c.stage, c.iteration, e.created_at,"
+            " MAX(e.latency_ms, CASE WHEN e.reason IS NULL THEN 0 ELSE COALESCE(("
+            "  SELECT f.latency_ms FROM events f WHERE f.clip_id = e.clip_id AND f.rater_id = e.rater_id"
+            "  AND f.repeat = e.repeat AND f.kind = 'skip' AND f.id < e.id ORDER BY f.id DESC LIMIT 1"
+            " ), 0) END), c.demo_step, c.steps, e.repeat"
+            " FROM events e JOIN clips c ON c.id = e.clip_id JOIN runs r ON r.id = c.run"
+            " JOIN raters p ON p.id = e.rater_id"
+            " WHERE e.kind = 'skip' AND (?1 IS NULL OR c.run = ?1) AND NOT EXISTS ("
+            "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
+            "  AND l.repeat = e.repeat AND l.id > e.id) ORDER BY e.id",
+            (run,),
         )
 
     def newest_ratings(self, run: str, most: int, columns: Sequence[str]) -> list[tuple]:

@@ -16,9 +16,37 @@ import numpy as np
 
 from trainer.records import Segment
 from trainer.store import RatedSegment
+from trainer.timing import frame_of_step
 
 INSIDE, OUTSIDE = 0, 1
 """Points that the marked steps and the others differ from the rating of their clip."""
+
+
+def seconds_of_pictures(
+    pictures: tuple[float, float], demo_step: int, steps: int, *, dt: float, fps: float, frames: int
+) -> tuple[float, float]:
+    """The stretch of a clip during which some of its pictures are on screen, seconds from its start.
+
+    A picture stays until the control step at which the next one is due, so pictures are of unequal length:
+    3 or 4 steps at 30 per second and 0.008 s. Both ends are whole steps; ``TrainingSet`` gets these back.
+
+    Args:
+        pictures: The first of them, and the one after the last; whole numbers.
+        demo_step: Control step of the demo at which the clip begins.
+        steps: Its length.
+        dt: Seconds of a control step.
+        fps: Pictures per second of the demo.
+        frames: Pictures of the demo.
+
+    Raises:
+        ValueError: If they are no stretch of the clip's pictures.
+    """
+    shown = frame_of_step(demo_step + np.arange(steps), dt, fps, frames)
+    edges = [*np.unique(shown, return_index=True)[1].tolist(), steps]
+    first, after = pictures
+    if not (first in range(len(edges)) and after in range(len(edges)) and first < after):
+        raise ValueError(f"a mark is a stretch of the clip's {len(edges) - 1} pictures, got {pictures}")
+    return round(edges[int(first)] * dt, 6), round(edges[int(after)] * dt, 6)
 
 
 def marked_steps(rating: RatedSegment) -> np.ndarray:
