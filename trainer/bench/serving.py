@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 from aiohttp import ClientSession
 
@@ -46,12 +47,7 @@ class Server:
     def __init__(self, data_dir: Path, settings: Sequence[str] = ()) -> None:
         self.data_dir = data_dir
         self._log = data_dir.with_name(f"{data_dir.name}.err").open("w+")
-        # By name: what is measured stands above this package, which imports nothing of it.
-        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
-        command += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
-        command += [word for setting in settings for word in ("--set", setting)]
-        command += ["--new-run"] if settings else []
-        self._child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self._log, text=True)
+        self._child = self.spawn(data_dir, settings, self._log)
         assert self._child.stdout is not None
         lines = [self._child.stdout.readline() for _ in range(2)]
         self.links = dict(line.strip().split(": ", 1) for line in lines if line)
@@ -63,6 +59,18 @@ class Server:
         with closing(Store(data_dir)) as store:  # nobody practises here
             for rater in store.raters():
                 store.set_practised(rater.id)
+
+    @staticmethod
+    def spawn(
+        data_dir: Path, settings: Sequence[str] = (), log: IO[str] | int = subprocess.DEVNULL
+    ) -> subprocess.Popen[str]:
+        """The process alone, just begun; it says on its standard output when it is ready."""
+        # By name: what is measured stands above this package, which imports nothing of it.
+        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
+        command += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
+        command += [word for setting in settings for word in ("--set", setting)]
+        command += ["--new-run"] if settings else []
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
 
     @property
     def base(self) -> str:
@@ -94,8 +102,13 @@ class Server:
         assert found is not None, f"the kernel tells no {what}"
         return int(found[1]) / 1024
 
+    def kill(self) -> None:
+        """Ends the process as a power cut would."""
+        self._child.kill()
+        self.close()
+
     def close(self) -> None:
-        """Ends the process as ``kill`` would; by force if it takes half a minute."""
+        """Ends the process as the command ``kill`` would; by force if it takes half a minute."""
         self._child.terminate()
         try:
             self._child.wait(30)
