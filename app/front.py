@@ -25,6 +25,7 @@ from app.files import Files, Filmed
 from app.listening import Listening
 from app.pictures import Pictures
 from app.proxy import Proxy
+from app.uploads import Uploads
 from trainer.errors import UserError
 from trainer.records import Status
 
@@ -89,6 +90,7 @@ class Front:
         self._actions = Actions(page)
         self._files = Files(page)
         self._downloads = Downloads(store, SECURITY_HEADERS)
+        self._uploads = Uploads(store.path.parent)
         self._door = Door(store, listening, lambda: self._port)
         self._proxy = Proxy(page, store)
         self._html = assets.page_html()
@@ -125,6 +127,7 @@ class Front:
             Route("GET", "/segments.parquet", "researcher", downloads.parquet, "took out segments"),
             Route("GET", "/card.md", "researcher", downloads.card, "took out the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
+            Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),
         )
 
     def start(self) -> str:

@@ -38,7 +38,8 @@ def link_token(secret: bytes, rater: Rater, generation: int = 0) -> str:
 
 def hash_token(token: str) -> str:
     """What the database keeps of a token: its SHA-256, hex."""
-    return hashlib.sha256(token.encode()).hexdigest()
+    # A cookie may hold any bytes; those that are no UTF-8 are the token of nobody.
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def new_session_token() -> str:

@@ -8,6 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from app import charts
+from app.uploads import form_html
 from trainer.config import METHODS
 from trainer.demos import list_demos
 from trainer.records import Status
@@ -48,6 +49,7 @@ class Runs:
         ]
         demos = [demo.name for demo in list_demos(page.trainer.data_dir / "demos")]
         gui.add_html(new_run_html(demos, [entry["id"] for entry in self._store.runs()]))
+        gui.add_html(form_html())
 
     def show(self) -> None:
         """Lists the runs."""

@@ -250,6 +250,35 @@ document.addEventListener("submit", (event) => {
   place.textContent = "One moment: the run at hand ends its iteration first.";
   post("do", { do: form.dataset.act, ...fields }).catch((error) => (place.textContent = error.message));
 });
+// A video on its way: fetch tells nothing of how far it is, hence the older request.
+document.addEventListener("submit", (event) => {
+  const form = event.target.closest?.("[data-upload]");
+  if (!form) return;
+  event.preventDefault();
+  const place = form.parentElement.querySelector(".od-form-note");
+  const button = form.querySelector("button");
+  const done = (text) => {
+    place.textContent = text;
+    button.disabled = false;
+  };
+  const request = new XMLHttpRequest();
+  request.upload.onprogress = ({ loaded, total }) => {
+    const share = Math.floor((100 * loaded) / total);
+    place.textContent = share < 100 ? `Uploading: ${share} %` : "The video is there and is being looked at.";
+  };
+  request.onload = () => {
+    if (request.status !== 200) return done(request.responseText);
+    const choice = document.querySelector(".od-new-run select[name=demo]");
+    choice?.add(new Option(form.elements.name.value));
+    form.reset();
+    done(request.responseText);
+  };
+  request.onerror = () => done("The connection broke off before the video had arrived. Please try again.");
+  request.open("POST", form.dataset.upload);
+  button.disabled = true;
+  place.textContent = "Uploading";
+  request.send(new FormData(form));
+});
 document.addEventListener("input", (event) => {
   const form = event.target.closest?.("[data-filter]");
   if (!form) return;

@@ -35,6 +35,9 @@ START_S = 10.0
 """What a start may take, until a clip or a waiting state is shown."""
 _EARLY = 0.15
 """Share of kills while it starts."""
+_RATED = 0.8
+"""Share of lives in which it is waited for a first rating."""
+_PATIENCE_S = 20.0
 _SHOWN = ".od-clip > [data-src][data-clip][data-frame]"
 
 
@@ -156,7 +159,11 @@ async def one_life(
         await asyncio.wait_for(shown.wait(), 60)
         if not settings:  # the first of all looks at the demo
             tally.slowest_start_s = max(tally.slowest_start_s, time.monotonic() - began)
-        await asyncio.sleep(rng.uniform(0.1, 5.0))
+        given = ratings.given.total()
+        end = time.monotonic() + (_PATIENCE_S if rng.random() < _RATED else 0)
+        while ratings.given.total() == given and time.monotonic() < end:
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(rng.uniform(0.1, 3.0))
     except TimeoutError:
         tally.notes.append("a start showed nothing within a minute")
     server.kill()
