@@ -9,7 +9,7 @@ BIN := .venv/bin
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: run setup test test-fast check bench clean
+.PHONY: run setup test test-fast check chaos soak bench clean
 
 run: .venv/.installed
 	$(BIN)/onedemo serve --host "$(HOST)" --port "$(PORT)" --data-dir "$(DATA_DIR)" --demo "$(DEMO)" $(OPTIONS)
@@ -26,6 +26,19 @@ check: .venv/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --level error --pythonpath $(BIN)/python
+
+# What the tests do in seconds, for long: 20 minutes, and two hours. Tables of figures are left in promises/.
+chaos: .venv/.installed-test
+	@mkdir -p promises
+	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/test_resume.py tests/test_faults.py
+	PYTHONPATH=. $(BIN)/python tests/check_door.py --json promises/door.json
+	PYTHONPATH=. $(BIN)/python tests/check_kill.py --json promises/kill.json
+	@$(BIN)/python tests/promises.py promises/chaos.md promises/kill.json promises/door.json
+
+soak: .venv/.installed-test
+	@mkdir -p promises
+	PYTHONPATH=. $(BIN)/python tests/check_soak.py --json promises/soak.json
+	@$(BIN)/python tests/promises.py promises/soak.md promises/soak.json
 
 bench: .venv/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'

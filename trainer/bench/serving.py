@@ -77,6 +77,11 @@ class Server:
         """Address of its front."""
         return self.links["annotator"].split("/login")[0]
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._child.pid
+
     def phase(self) -> str:
         """What the trainer does: "pretrain", "online", "paused", ..."""
         with urllib.request.urlopen(f"{self.base}/healthz", timeout=10) as answer:
