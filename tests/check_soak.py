@@ -1,7 +1,8 @@
 """Hours of rating and training on a real server, to see that it grows nowhere.
 
 ``python tests/check_soak.py --minutes 120`` ends with one line of figures; its exit code is 1 if a promise
-was broken: memory a quarter of the way and at the end within 5 %, no more open files or threads, no rating lost.
+was broken: memory a quarter of the way and at the end within 5 %, no more open files or threads, no rating
+lost.
 """
 
 from __future__ import annotations
