@@ -1,11 +1,14 @@
 """What goes wrong around a training, for real: it says so plainly, loses nothing, goes on by itself."""
 
 import errno
+import os
+import re
 import resource
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
 
 import pytest
 from test_loop import make_trainer, rate_all, wait_for
@@ -46,11 +49,62 @@ def no_room(file):
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
+@contextmanager
+def full(file):
+    """The small disk that the data is on has no block left."""
+    ballast = file.with_name("ballast")
+    with ballast.open("wb", buffering=0) as out:
+        with suppress(OSError):
+            while out.write(b"x" * 4096):
+                pass
+    try:
+        yield
+    finally:
+        ballast.unlink()
+
+
+@contextmanager
+def no_right(file):
+    """This process is somebody who may not write to the data directory."""
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of its own, of 24 MB, for the data."""
+    place = tmp_path / "data"
+    place.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", place], capture_output=True)
+    if mounted.returncode:
+        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
+    yield
+    subprocess.run(["umount", "-l", place], check=True)
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [(locked, "Another program holds the database"), (no_room, "A file has grown")],
+    [
+        (locked, "Another program holds the database"),
+        (no_room, "A file has grown"),
+        (full, "The disk is full"),
+        (no_right, "may not be written to"),
+    ],
 )
-def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(tmp_path, monkeypatch, fault, words):
+def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
+    tmp_path, monkeypatch, request, fault, words
+):
+    if fault is full:
+        request.getfixturevalue("small_disk")
+    if fault is no_right:
+        if os.geteuid() != 0:
+            pytest.skip("only root can become somebody without the right and come back")
+        for place in (tmp_path, *tmp_path.parents):  # it may be read, as before
+            with suppress(OSError):
+                place.chmod(place.stat().st_mode | 0o055)
     monkeypatch.setattr("trainer.loop._REST_S", (0.5, 1.0))
     demo = falling_demo(tmp_path / "demo")
     config = small_config(rollouts__total_steps=10**6, ratings__online=200)
@@ -85,3 +139,18 @@ def test_errors_are_told_in_plain_words():
         with pytest.raises(sqlite3.OperationalError) as full:
             db.execute("CREATE TABLE t (x)")
         assert in_words(full.value).startswith("The disk is full")
+
+
+def test_nothing_goes_by_the_clock_on_the_wall():
+    """A clock that is set back changes no order and no waiting: those go by numbers and by monotonic time.
+
+    The time of day is written down, as text, and ends links; nothing else is done with it.
+    """
+    root = Path(__file__).parents[1]
+    stamps = {"database.py", "people.py", "card.py", "exports.py", "backup.py"}
+    for path in [*root.glob("app/*.py"), *root.glob("trainer/*.py")]:
+        text = path.read_text()
+        assert not re.search(r"\btime\.time\(", text), path
+        assert path.name in stamps or not re.search(r"datetime\.(now|today)\(", text), path
+        for order in re.findall(r"(?:ORDER BY|MAX\()[^\"']*", text):
+            assert "_at" not in order, f"{path}: {order}"
