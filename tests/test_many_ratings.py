@@ -77,7 +77,7 @@ def test_the_data_tab_shows_the_tallies(store):
     rows = rating_rows(store, _RUN)
     people = {rater.name: rater for rater in store.raters()}
     html = data_html(
-        _RUN, "onedemo", store.tallies(_RUN), quality(rows), quality_by_rater(rows), people, set()
+        _RUN, "onedemo", store.tallies(_RUN), quality(rows), quality_by_rater(rows), {}, people, set()
     )
     assert "500 ratings" in html
     row = '<th scope="row">rater 3</th><td>pretrain</td>'
