@@ -16,8 +16,10 @@ run: .venv/.installed
 
 setup: .venv/.installed
 
+# Two processes: what the one tier has loaded and left in memory does not weigh on the other.
 test: .venv/.installed-test
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -m "not seam"
+	$(BIN)/python -m pytest -m seam
 
 test-fast: .venv/.installed-test
 	$(BIN)/python -m pytest -m "not seam"
