@@ -12,6 +12,15 @@ import pytest
 
 # Before anything imports mujoco: there is no screen.
 os.environ.setdefault("MUJOCO_GL", "egl")
+if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by the tests side by side
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Side by side, a file stays in one process, and so do the tests that share runs of tables."""
+    for item in items:
+        shared = "results" in getattr(item, "fixturenames", ())
+        item.add_marker(pytest.mark.xdist_group("results" if shared else item.path.stem))
 
 
 @pytest.fixture(scope="session")
