@@ -25,7 +25,7 @@ from aiohttp import ClientSession
 from trainer.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
 from trainer.store import FILE_NAME, NewClip, Store
 
-_PATIENCE_S = 300.0
+_PATIENCE_S = 900.0
 _IN_HAND = 2
 """Clips at each open page: one on screen, one fetched ahead."""
 _SPARE = 50
@@ -213,7 +213,7 @@ async def reach(condition: Callable[[], object], what: str) -> None:
     """Waits until something is so, however slow the machine is.
 
     Raises:
-        RuntimeError: If it takes more than five minutes.
+        RuntimeError: If it takes more than a quarter of an hour.
     """
     end = time.monotonic() + _PATIENCE_S
     while not await asyncio.to_thread(condition):
