@@ -24,7 +24,7 @@ test: .venv/.installed-test
 	$(PYTEST) -m seam
 
 test-fast: .venv/.installed-test
-	$(PYTEST) -m "not seam"
+	$(PYTEST) -m "not seam and not slow"
 
 check: .venv/.installed-test
 	$(BIN)/ruff check .

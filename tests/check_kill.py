@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import math
 import random
 import sqlite3
 import sys
@@ -23,8 +24,8 @@ from pathlib import Path
 
 from trainer.bench.annotators import browser_session, open_tab, rating
 from trainer.bench.painted import CHROMIUM_FLAGS, find_chromium
-from trainer.bench.serving import Server
-from trainer.store import FILE_NAME
+from trainer.bench.serving import Server, annotator_link
+from trainer.store import FILE_NAME, Store
 
 SETTINGS = [
     "predictor.appearance=false", "ratings.pretrain=30", "ratings.online=1000000", "ratings.rounds=2",
@@ -96,7 +97,7 @@ async def at_a_socket(link: str, ratings: Ratings, opened: Callable[[], None]) -
             await tab.until(lambda: tab.clip or tab.waiting, "the page")
             opened()
             while True:
-                await tab.until(lambda: tab.clip, "a clip")
+                await tab.until(lambda: tab.clip, "a clip", math.inf)  # until it is drawn
                 press = (tab.clip or 0, rating(tab))
                 ratings.open[press] += 1
                 await tab.rate(press[1])
@@ -150,10 +151,12 @@ async def one_life(
         tally.kills += 1
         return
     server = await asyncio.to_thread(Server, data_dir, settings)
+    with closing(Store(data_dir)) as store:
+        second = annotator_link(server, store, "second")
     shown = asyncio.Event()
     people = [
         asyncio.ensure_future(person(server.links["annotator"], ratings, shown.set)),
-        asyncio.ensure_future(at_a_socket(server.links["researcher"], ratings, shown.set)),
+        asyncio.ensure_future(at_a_socket(second, ratings, shown.set)),
     ]
     try:
         await asyncio.wait_for(shown.wait(), 60)
@@ -166,6 +169,9 @@ async def one_life(
         await asyncio.sleep(rng.uniform(0.1, 3.0))
     except TimeoutError:
         tally.notes.append("a start showed nothing within a minute")
+    for somebody in people:
+        if somebody.done():
+            tally.notes.append(f"somebody could not rate: {somebody.exception()!r}")
     server.kill()
     tally.kills += 1
     done = await asyncio.gather(*people, return_exceptions=True)

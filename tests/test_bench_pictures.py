@@ -21,12 +21,14 @@ def test_drawing_is_several_times_faster_than_gymnasium():
     assert figure.value > 3
 
 
+@pytest.mark.slow
 def test_features_are_equal_and_not_slower():
     figures = {figure.name: figure for figure in pictures._features(turns=1)}
     assert set(figures) == {"features_vs_single", "features_vs_single_one_core"}
     assert figures["features_vs_single_one_core"].value > 1.2
 
 
+@pytest.mark.slow
 def test_kept_features_and_longer_demos(tmp_path):
     cached = pictures._cached(tmp_path, turns=1)
     assert cached.unit == "ms" and cached.value < 500

@@ -15,6 +15,7 @@ from contextlib import closing
 
 import aside
 import pytest
+import torch
 from test_demos import make_video
 from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
@@ -27,6 +28,8 @@ from trainer.bench.annotators import browser_session, open_tab, rating
 from trainer.bench.serving import reach, serving
 from trainer.demos import import_video
 from trainer.errors import UserError
+from trainer.files import archive_fault, jpeg_fault, read_whole
+from trainer.predictor import Snapshot
 from trainer.store import FILE_NAME, Store
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
@@ -116,6 +119,38 @@ def test_ratings_may_come_while_a_backup_is_made(data_dir, tmp_path):
             stop.set()
             thread.join()
         assert store.last_event() > before + 10
+
+
+def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir, demo, caplog):
+    """A run that has lost its last checkpoint and its last predictor makes both again, to the bit."""
+    snapshot = newest(data_dir)
+    checkpoint = snapshot.parents[1] / "checkpoint.pt"
+    with closing(Store(data_dir)) as store:
+        run = store.runs()[0]["id"]
+
+        def go_on():
+            rate = Simulated(name="rule", rate=lambda segment, step: 3)
+            make_trainer(store, demo, rate, small_config(), name=run).work()
+            rows = store.iterations(run)
+            return [{key: row[key] for key in row.keys() - {"steps_per_s"}} for row in rows]
+
+        before, fitted = go_on(), Snapshot.load(snapshot).tensors()
+        for file in (snapshot, checkpoint):
+            flip(file)
+        assert go_on() == before
+        again = Snapshot.load(snapshot).tensors()
+        for file in (snapshot, checkpoint):
+            assert file.with_name(f"{file.name}.damaged").exists() and not archive_fault(file.read_bytes())
+            assert f"{file} is damaged" in caplog.text
+        for name, tensor in fitted.items():
+            torch.testing.assert_close(again[name], tensor, rtol=0, atol=0)
+
+
+def test_a_damaged_picture_is_drawn_again(tmp_path):
+    file = tmp_path / "000001.jpg"
+    file.write_bytes(b"\xff\xd8 and no end")
+    assert read_whole(file, jpeg_fault) is None
+    assert not file.exists() and (tmp_path / "000001.jpg.damaged").exists()
 
 
 def test_a_predictor_that_the_copied_database_does_not_know_is_left_out(data_dir, tmp_path):
@@ -283,7 +318,7 @@ def orphan_rows(data_dir):
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
-        (lambda d: flip(newest(d)), r"holds a damaged .*\.pt: restore a backup"),
+        (lambda d: flip(newest(d)), r"holds a damaged .*\.pt: it will be set aside"),
         (lambda d: newest(d).unlink(), r"lacks .*\.pt: a predictor; the newest there is used"),
         (lambda d: flip(next(d.glob("runs/*/checkpoint.pt"))), r"holds a damaged .*checkpoint\.pt"),
         (lambda d: (d / "runs" / "stranger").mkdir(), "does not know .*stranger: a directory of no run"),

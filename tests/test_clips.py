@@ -53,6 +53,7 @@ def test_demo_left_agent_right_white_between():
     assert frame[180, SIDE_WIDTH + GAP // 2].min() > 245
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "columns"), [(10, 1), (40, 1), (41, 2), (151, 4)])
 def test_both_sides_show_the_same_moment_and_no_picture_is_too_high(count, columns):
     def bars(colour):

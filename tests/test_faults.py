@@ -7,6 +7,7 @@ import resource
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
@@ -127,6 +128,38 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
         assert numbers == list(range(1, len(numbers) + 1))
         with closing(sqlite3.connect(store.path)) as db:
             assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
+    """The page does not flicker between "starting", "online" and "failed" with every try."""
+    monkeypatch.setattr("trainer.loop._REST_S", (0.1, 0.1))
+    tries = []
+
+    def break_down(self, snapshot):
+        tries.append(snapshot)
+        time.sleep(0.1)  # of trying
+        raise FloatingPointError("the policy has exploded")
+
+    demo = falling_demo(tmp_path / "demo")
+    config = small_config(rollouts__total_steps=10**6, ratings__online=200)
+    with closing(Store(tmp_path / "data")) as store:
+        ann = store.ensure_rater("Ann", "annotator")
+        trainer = make_trainer(store, demo, config=config)
+        trainer.start()
+        try:
+            wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1, 60)
+            with monkeypatch.context() as broken:
+                broken.setattr("trainer.learner.Learner.iterate", break_down)
+                wait_for(lambda: trainer.status().error, 60)
+                seen, end = set(), time.monotonic() + 60
+                while len(tries) < 4:
+                    assert time.monotonic() < end
+                    seen.add((trainer.status().phase, bool(trainer.status().error)))
+                    time.sleep(0.002)
+                assert seen == {("failed", True)}
+            wait_for(lambda: trainer.status().phase == "online" and not trainer.status().error, 60)
+        finally:
+            trainer.stop()
 
 
 def test_errors_are_told_in_plain_words():

@@ -81,6 +81,7 @@ def test_learning_on_the_gpu_is_learning_on_the_cpu(features):
     np.testing.assert_allclose(*figures, rtol=0.05, atol=1e-3)
 
 
+@pytest.mark.slow
 @METHODS
 def test_any_number_of_threads_gives_the_same_policy(features, method):
     ends = []
@@ -117,6 +118,7 @@ def test_predicted_rating_of_a_clip_is_the_mean_over_its_steps(features):
     assert learner.predict(snapshot, one.segment, one.demo_step) == pytest.approx(np.mean(single), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_practice_raises_the_predicted_rating(features):
     config = small_config(
         rollouts__lanes=16, rollouts__steps=125, rollouts__total_steps=10**6, predictor__updates=200
@@ -135,6 +137,7 @@ def test_practice_raises_the_predicted_rating(features):
     assert whole_episodes() > before + 0.3
 
 
+@pytest.mark.slow
 @METHODS
 def test_a_resumed_learner_does_what_the_uninterrupted_one_does(features, tmp_path, method):
     config = CONFIGS[method]() if method == "paper" else onedemo(practice__give_up=0.5)
@@ -256,6 +259,7 @@ def test_the_policy_sees_what_the_demo_shows_now_and_ahead(features):
         np.testing.assert_allclose(seen, expected, atol=1e-5)  # nothing is normalised yet
 
 
+@pytest.mark.slow
 def test_of_another_body_it_sees_pictures_and_imagines_poses(features):
     """No track: what the frames look like takes its place in the policy, and the predictor makes one up."""
     learner = Learner(onedemo(), FRAMES, 30.0)
@@ -289,6 +293,7 @@ def test_practice_follows_the_predictor(features, by_distance):
     np.testing.assert_array_equal(rollouts.next_qpos[:, -1][~ended[:, -1]], again.qpos[:, 0][~ended[:, -1]])
 
 
+@pytest.mark.slow
 def test_a_new_snapshot_fills_a_new_bank(features, by_distance):
     learner = make_learner(features, onedemo())
     ratings = asked(learner, by_distance, 40)
@@ -300,6 +305,7 @@ def test_a_new_snapshot_fills_a_new_bank(features, by_distance):
     assert not np.array_equal(banks[0].qpos, banks[2].qpos)
 
 
+@pytest.mark.slow
 def test_onedemo_end_to_end_learns_to_be_like_the_demo(features, by_distance):
     """From sixty ratings in two rounds to a policy that gets more of the demo done from standing."""
     config = onedemo(rollouts__lanes=16, rollouts__steps=125, rollouts__total_steps=20_000)

@@ -107,6 +107,7 @@ def test_every_reward_can_be_traced_to_ratings(store, demo):
     assert stages.count("pretrain") == 12 and stages.count("online") == 6
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_run(demo, tmp_path):
     curves = []
     for name, threads in (("one", 2), ("two", 1)):
@@ -208,6 +209,7 @@ def few_wild(monkeypatch):
     monkeypatch.setattr("trainer.practice._BANK_TRIES", 200)
 
 
+@pytest.mark.slow
 def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monkeypatch, few_wild):
     ann = store.ensure_rater("Ann", "annotator")
     looked = threading.Event()
@@ -237,6 +239,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
     trainer_.stop()
 
 
+@pytest.mark.slow
 def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     ann = store.ensure_rater("Ann", "annotator")
     config = small_config(
@@ -275,6 +278,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     assert not np.array_equal(expected.clock[0], np.arange(101))  # it waits, or hurries
 
 
+@pytest.mark.slow
 def test_clips_for_people_are_chosen_a_few_at_a_time(store, demo):
     ann = store.ensure_rater("Ann", "annotator")
     trainer_ = make_trainer(store, demo, config=small_config(ratings__queue=12, ratings__pretrain=100))

@@ -256,6 +256,7 @@ def blind(view):
     return replace(view, track=None, basis=track_basis(features, view.fps))
 
 
+@pytest.mark.slow
 def test_where_no_pose_is_seen_the_ratings_say_what_the_demo_shows(blind, rollouts, view, tmp_path):
     """The track is fitted with the rest; a demo of another body is no different."""
     ratings, frames, _ = world(rollouts, view, 300, seed=0)
@@ -281,6 +282,7 @@ def test_an_empty_segment_list_is_refused(view):
         fit([], np.empty((0, STEPS), int), view, CONFIG, number=1, seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seen", [True, False])
 def test_the_shortest_clips_that_can_be_asked_for(view, blind, seen):
     """0.05 s, six control steps."""

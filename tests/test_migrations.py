@@ -107,6 +107,7 @@ def test_a_newer_database_is_refused_and_not_touched(tmp_path):
 MIGRATE = "import sys; from pathlib import Path; from trainer.store import Store; Store(Path(sys.argv[1]))"
 
 
+@pytest.mark.slow
 def test_a_migration_that_is_killed_leaves_a_whole_version(tmp_path):
     """Killed at moments all over it, each database is of some version and goes on from there."""
     began = time.monotonic()

@@ -84,6 +84,7 @@ def test_the_network_is_the_papers():
     assert [type(m).__name__ for m in plain.head] == ["ReLU", "Linear"]
 
 
+@pytest.mark.slow
 def test_it_learns_a_rule_of_frame_and_state(visual):
     ratings, frames = world(300, seed=0)
     snapshot, stats = fit(ratings, frames, visual, paper(visual_dims=8), number=1, seed=0)

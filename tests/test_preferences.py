@@ -197,6 +197,7 @@ def tiny(**options):
     return PreferencesConfig(**(defaults | options))
 
 
+@pytest.mark.slow
 def test_same_seed_same_policy():
     a, b, c = (
         train_preferences(tiny(seed=s, threads=n), progress=False) for s, n in ((1, 1), (1, 2), (2, 1))
@@ -234,6 +235,7 @@ def test_settings_that_cannot_be():
     assert preferences.split_comparisons(2) == (1, 1)
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, capsys):
     """One iteration of the real size, with few comparisons."""
     out = tmp_path / "p"

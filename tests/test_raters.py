@@ -169,6 +169,7 @@ def test_a_rater_that_declines_everything_ends_the_run(store, tmp_path, monkeypa
     assert sum(store.ratings_by_class()) == 0
 
 
+@pytest.mark.slow
 def test_a_rater_that_tires_of_the_policy_does_not_stop_it(store, tmp_path, monkeypatch):
     """From the first iteration on it declines everything: the run ends with what it has."""
     rate = Oracle.rate

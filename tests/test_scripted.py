@@ -109,6 +109,7 @@ def test_what_is_seen_of_marks_and_robot():
     assert visible(qpos, qvel)[1, 3] == 0.5
 
 
+@pytest.mark.slow
 def test_wild_random_motion_gets_more_than_ones(marks):
     """Statistics of the random policy, printed; a rater of ones alone would teach nothing."""
     from trainer.config import load_config
@@ -159,6 +160,7 @@ def test_a_bad_table_is_one_sentence(table, sentence, person, tmp_path):
         make_rater(f"script:{file}", None, demo=person, budget=1)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not VIDEO.exists(), reason="needs the video of a real person, which is not in the repository"
 )

@@ -60,6 +60,7 @@ def test_a_lens_sees_another_demo_as_its_own():
     assert flat.axes.shape == (40, 5) and np.count_nonzero(np.abs(flat.axes).sum(axis=0)) == 4
 
 
+@pytest.mark.slow
 def test_a_feature_that_hardly_changed_in_the_first_demo_does_not_make_the_fit_diverge():
     """Of 40 features, ten changed by a millionth in the first demo, and change freely in the second."""
     one, two = walk(0), walk(1)
@@ -74,6 +75,7 @@ def test_a_feature_that_hardly_changed_in_the_first_demo_does_not_make_the_fit_d
     assert np.isfinite(probabilities(tuned, ratings, frames)).all()
 
 
+@pytest.mark.slow
 def test_a_network_from_another_demo_needs_fewer_ratings():
     """Both demos turn along the same direction of the features; the second begins where the first ends."""
     direction = np.random.default_rng(5).normal(size=40)
@@ -97,6 +99,7 @@ def test_a_network_from_another_demo_needs_fewer_ratings():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_fits_from_the_same_start_are_the_same_and_leave_it_alone():
     view, (ratings, frames) = through(fit_lens(walk(0), 8), walk(0)), world(40, seed=0)
     start, _ = fit(ratings, frames, view, NETWORK, number=1, seed=1)
@@ -133,6 +136,7 @@ def poses(count, seed, matters):
     return view, ratings, np.zeros((count, 38), int)
 
 
+@pytest.mark.slow
 def test_a_metric_keeps_what_mattered_in_another_demo():
     view, ratings, frames = poses(300, 0, matters=0)
     start, _ = fit(ratings, frames, view, METRIC, number=4, seed=0)
@@ -172,6 +176,7 @@ def test_a_start_of_another_kind_or_size_is_refused():
         learner.look_at(walk(0, features=20))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["network", "metric", "imagined"])
 def test_a_saved_start_is_the_same_start(kind, tmp_path):
     if kind == "network":
@@ -192,6 +197,7 @@ def test_a_saved_start_is_the_same_start(kind, tmp_path):
     assert (loaded.beside(view) is None) == (kind == "imagined")
 
 
+@pytest.mark.slow
 def test_before_the_first_rating_the_start_chooses():
     config = small_config(ratings__choice="mix")
     features = walk(0)
@@ -208,6 +214,7 @@ def test_before_the_first_rating_the_start_chooses():
     assert liked[1] > liked[0] + 0.15
 
 
+@pytest.mark.slow
 def test_a_learner_fits_from_a_metric():
     view, ratings, frames = poses(60, 0, matters=0)
     start, _ = fit(ratings, frames, view, METRIC, number=1, seed=0)
@@ -243,6 +250,7 @@ def begin(store, demo, rate, start=None):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_run_from_a_start_goes_on_without_it(demo, tmp_path):
     """Stopped and gone on with after the other run is gone, it ends like the uninterrupted one."""
     start = start_file(demo, tmp_path / "source")

@@ -102,6 +102,7 @@ def test_without_the_video_the_table_says_why_and_succeeds(no_video, tmp_path, c
     assert "ONEDEMO_PERSON_VIDEO" in (out / "report.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_strip_shows_the_same_moments_of_both(tmp_path):
     demo = find_demo("hopper-hop", tmp_path)
     hidden = load_hidden(hidden_path(demo.path))

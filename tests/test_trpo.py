@@ -243,6 +243,7 @@ def test_nothing_to_gain_changes_nothing():
         assert torch.equal(parameters(policy), before)
 
 
+@pytest.mark.slow
 def test_value_function_bootstraps_through_the_time_limit():
     """Reward 1 for ever, cut into episodes of 5 steps: V must still become 1 / (1 - gamma)."""
     policy = small_policy()
@@ -275,6 +276,7 @@ def hopper(seed, rounds, lanes=16, steps=250):
     return policy, trpo, collector, per_episode
 
 
+@pytest.mark.slow
 def test_hopper_learns_to_stay_up():
     """28 thousand steps of Hopper-v5: the reward of an episode grows several times."""
     *_, per_episode = hopper(0, 7)

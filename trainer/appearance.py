@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import io
 import logging
-import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from torch.nn import functional
 
 from trainer import body, envs
 from trainer.encoders import Encoder
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.render import RenderThread
 from trainer.starts import wild_rollouts
 
@@ -122,12 +121,9 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], 
     spec = envs.spec(env_name)
     model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
     path = cache_dir / f"{env_name}-{model}-{encoder.name}-v{_VERSION}.npz"
-    if path.exists():
-        try:
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-                return Appearance(stored)
-        except (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-            _log.warning("%s is damaged (%s): made anew", path, error)
+    if (data := read_whole(path)) is not None:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+            return Appearance(stored)
     appearance = regress(*pictures(env_name, encoder, PICTURES, check), check)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)

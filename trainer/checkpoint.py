@@ -1,4 +1,4 @@
-"""Where a training was after an iteration: one file, replaced whole.
+"""Where a training was after an iteration: one file, replaced whole, and the one before it.
 
 It holds what the learner is, the iteration's row in the database, and while there are questions left the
 rollouts that they are cut from: a training that was killed asks what it would have asked.
@@ -9,13 +9,15 @@ Shapes: N lanes, T control steps.
 from __future__ import annotations
 
 import io
+import os
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.records import Rollouts
 
 _UNSEEN = ("inputs", "next_inputs")
@@ -32,23 +34,30 @@ def save_checkpoint(file: Path, learner: dict[str, Any], row: dict[str, Any], po
         pool: Rollouts that clips are still cut from, (N, T); None if nobody is asked any more.
 
     Raises:
-        OSError: If it cannot be written; the one before is then untouched.
+        OSError: If it cannot be written; the one before is then the newest.
     """
     buffer = io.BytesIO()
     torch.save({"learner": learner, "row": row, "pool": _pack(pool) if pool is not None else None}, buffer)
+    with suppress(FileNotFoundError):
+        os.replace(file, _before(file))
     write_atomic(file, buffer.getvalue())
 
 
 def load_checkpoint(file: Path) -> tuple[dict[str, Any], dict[str, Any], Rollouts | None] | None:
-    """What ``save_checkpoint`` was given; None if there is no such file.
+    """What ``save_checkpoint`` was given last, or before that if the file is damaged; None if nothing is.
 
     The pool's policy inputs have width 0. Checkpoints of before pools were kept have none.
     """
-    if not file.exists():
+    data = read_whole(file) or read_whole(_before(file))
+    if data is None:
         return None
-    saved = torch.load(file, weights_only=True, map_location="cpu")
+    saved = torch.load(io.BytesIO(data), weights_only=True, map_location="cpu")
     pool = saved.get("pool")
     return saved["learner"], saved["row"], _unpack(pool) if pool is not None else None
+
+
+def _before(file: Path) -> Path:
+    return file.with_name(f"{file.stem}-before{file.suffix}")
 
 
 def _pack(pool: Rollouts) -> dict[str, torch.Tensor]:

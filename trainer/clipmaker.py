@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.clips import compose_clip
-from trainer.files import write_atomic
+from trainer.files import jpeg_fault, read_whole, write_atomic
 from trainer.records import Clip
 from trainer.render import Renderer, RenderThread
 from trainer.store import Store
@@ -63,8 +63,8 @@ class ClipMaker:
             self.submit(failed)
 
     def recover(self, run: str) -> None:
-        """After a restart: queues what was cut but never drawn, and what lost its picture."""
-        lost = [c for c in self._store.waiting_clips(run) if not self._file(c.id).exists()]
+        """After a restart: queues what was cut but never drawn, and what lost its picture or a part of it."""
+        lost = [c for c in self._store.waiting_clips(run) if not read_whole(self._file(c.id), jpeg_fault)]
         self._store.set_clip_state([c.id for c in lost], "cut")
         self.submit(self._store.waiting_clips(run, state="cut"))
 

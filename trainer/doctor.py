@@ -7,7 +7,6 @@ import os
 import shutil
 import sqlite3
 import sys
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from packaging.requirements import Requirement
 from trainer.demos import list_demos
 from trainer.encoders import make_encoder
 from trainer.errors import UserError
+from trainer.files import archive_fault, jpeg_fault
 from trainer.migrations import STEPS, check_version
 from trainer.render import HEIGHT, WIDTH, RenderThread
 from trainer.store import FILE_NAME
@@ -108,7 +108,7 @@ def _encoder(data_dir: Path) -> Iterator[Finding]:
         yield Finding("image network", False, f"{encoder.name} gives no features: install onedemo again")
         return
     kept = [*data_dir.glob("demos/*/features-*.npz"), *data_dir.glob("robots/*.npz")]
-    broken = [path for path in kept if _zip_fault(path)]
+    broken = sorted(_broken(kept, archive_fault))
     yield Finding(
         "image network", not broken,
         f"{_name(broken)} damaged: delete it, it is made anew" if broken
@@ -177,14 +177,14 @@ def _files(data_dir: Path) -> Iterator[Finding]:
     there = set(root.glob("*/snapshots/*.pt"))
     clips = {root / run / "clips" / f"{clip:06d}.jpg" for run, clip in waiting}
     pictures = set(root.glob("*/clips/*.jpg"))
-    kept = [*there, *root.glob("*/checkpoint.pt"), *root.glob("*/rollouts/*.npz")]
+    kept = [*there, *root.glob("*/checkpoint*.pt"), *root.glob("*/rollouts/*.npz")]
     orphans = [path for path in root.glob("*") if path.is_dir() and path.name not in runs]
     half = [path for path in data_dir.rglob(".*") if path.is_file()]
     faults = [
         ("lacks", named - there, "a predictor; the newest there is used, and the next fit makes another"),
         ("lacks", clips - pictures, "the picture of a clip; it is drawn again when onedemo starts"),
-        ("holds a damaged", _broken(kept, _zip_fault), "restore a backup, or delete it"),
-        ("holds a damaged", _broken(clips & pictures, _jpeg_fault), "delete it, it is drawn again"),
+        ("holds a damaged", _broken(kept, archive_fault), "it will be set aside, and the one before used"),
+        ("holds a damaged", _broken(clips & pictures, jpeg_fault), "delete it, it is drawn again"),
         ("set aside", set(data_dir.rglob("*.damaged")), "it was damaged and has been made anew: delete it"),
         ("does not know", set(orphans), "a directory of no run: delete it if nothing in it is wanted"),
         ("does not know", there - named, "a predictor that came too late: delete it if no server runs"),
@@ -214,28 +214,17 @@ def _open(path: Path) -> sqlite3.Connection:
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
 
 
-def _zip_fault(path: Path) -> bool:
-    """Whether a file of arrays or weights is damaged: both kinds are ZIP archives with checksums."""
+def _broken(paths: Iterable[Path], fault: Callable[[bytes], str]) -> set[Path]:
+    return {path for path in paths if _fault(path, fault)}
+
+
+def _fault(path: Path, fault: Callable[[bytes], str]) -> bool:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.testzip() is not None
+        return bool(fault(path.read_bytes()))
     except FileNotFoundError:  # replaced meanwhile
         return False
-    except (OSError, zipfile.BadZipFile, EOFError, ValueError, NotImplementedError):
+    except OSError:
         return True
-
-
-def _broken(paths: Iterable[Path], fault: Callable[[Path], bool]) -> set[Path]:
-    return {path for path in paths if fault(path)}
-
-
-def _jpeg_fault(path: Path) -> bool:
-    """Whether a picture is cut off or empty."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        return False
-    return not (data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9"))
 
 
 def _sha256(path: Path) -> str:

@@ -13,9 +13,9 @@ import logging
 import pickle
 import threading
 import urllib.error
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,7 +26,7 @@ from torch import nn
 
 from trainer.demos import stream_frames
 from trainer.errors import UserError
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.folded import BATCH, SIDE, Folded
 from trainer.records import Demo
 
@@ -95,16 +95,12 @@ def demo_features(demo: Demo, encoder: Encoder, cache_dir: Path) -> np.ndarray:
     """
     path = Path(cache_dir) / demo.sha256 / f"features-{encoder.name}.npz"
     shape = (demo.frames, encoder.dims)
-    if path.exists():
-        try:
-            # By way of memory: NumPy leaves the file open when the zip directory is damaged.
-            with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-                features = stored["features"]
+    if (data := read_whole(path)) is not None:
+        with np.load(io.BytesIO(data), allow_pickle=False) as stored, suppress(ValueError, KeyError):
+            features = stored["features"]
             if features.shape == shape and features.dtype == np.float32:
                 return features
-            _log.warning("%s holds %s and not %s: made anew", path, features.shape, shape)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            _log.warning("%s is damaged (%s): made anew", path, error)
+        _log.warning("%s does not hold features of shape %s: made anew", path, shape)
     features = encoder.encode(stream_frames(demo))
     if features.shape != shape or not np.isfinite(features).all():
         raise ValueError(f"{encoder.name} gave {features.shape}, wanted finite features {shape}")

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import fcntl
+import io
+import logging
 import os
 import tempfile
-from collections.abc import Iterable, Iterator
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from trainer.errors import UserError
+
+log = logging.getLogger("onedemo")
 
 _UMASK = os.umask(0)  # there is no way to ask without setting; once, before there are threads
 os.umask(_UMASK)
@@ -43,6 +48,46 @@ def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
         os.fsync(directory)  # the rename itself must survive a power cut
     finally:
         os.close(directory)
+
+
+def archive_fault(data: bytes) -> str:
+    """What is wrong with a file of arrays (NPZ) or weights (torch); "" if nothing is.
+
+    Both kinds are ZIP archives, which hold a checksum of each part.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            part = archive.testzip()
+    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError, OSError) as error:
+        return str(error) or "it ends too early"
+    return f"the checksum of its part {part} is wrong" if part is not None else ""
+
+
+def read_whole(path: Path, fault: Callable[[bytes], str] = archive_fault) -> bytes | None:
+    """A file as it was written; None if there is none, or a damaged one, which is then set aside.
+
+    Args:
+        path: Which. A damaged one becomes ``NAME.damaged``, so that another can take its place.
+        fault: Finds out what is wrong with its content; "" if nothing is.
+
+    Raises:
+        OSError: If it is there and cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    if found := fault(data):
+        os.replace(path, path.with_name(f"{path.name}.damaged"))
+        log.warning("%s is damaged (%s): set aside as %s.damaged, and made anew", path, found, path.name)
+        return None
+    return data
+
+
+def jpeg_fault(data: bytes) -> str:
+    """What is wrong with a picture, which has no checksum: whether it is empty or cut off."""
+    whole = data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")
+    return "" if whole else "it is empty or cut off"
 
 
 def check_writable(file: Path) -> None:

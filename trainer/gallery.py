@@ -21,7 +21,7 @@ import numpy as np
 
 from trainer.clips import side_by_side
 from trainer.demos import read_frames
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.predictor import Snapshot
 from trainer.records import Demo, Rollouts
 from trainer.render import Renderer, RenderThread
@@ -159,7 +159,10 @@ class Gallery:
         file = self._file(iteration, suffix)
         if file.exists():
             return file
-        with np.load(self._file(iteration, "npz"), allow_pickle=False) as data:
+        kept = read_whole(self._file(iteration, "npz"))
+        if kept is None:
+            raise FileNotFoundError(f"nothing of iteration {iteration} is left")
+        with np.load(io.BytesIO(kept), allow_pickle=False) as data:
             qpos, frames = data["qpos"].astype(np.float64), data["frames"]
         if suffix == "jpg":
             write_atomic(file, self._renderer.submit(lambda renderer: filmstrip(renderer, qpos)).result())

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
 from trainer.encoders import Encoder, demo_features
-from trainer.errors import in_words
+from trainer.errors import UserError, in_words
 from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.pairing import Pairing
@@ -260,6 +261,7 @@ class Trainer:
                 self._stop.wait(_TICK_S)
             else:
                 self._iterate(learner)
+            self._went_well()
         self._tell_stopped()
 
     def _prepare(self) -> Learner:
@@ -339,7 +341,6 @@ class Trainer:
         save_checkpoint(self._checkpoint, learner.state_dict(), row, rollouts if left else None)
         self.store.add_iteration(self.run, learner.iteration, **row)
         self._asking.withdraw_stale(learner.iteration)
-        self._rest_s = _REST_S[0]
         if self._watch is not None:
             self._watch(learner, snapshot)
         self._tell("online", "The robot is practising with what it learned from your ratings.", stats)
@@ -385,12 +386,17 @@ class Trainer:
                     self._ask(self._learner)
             except Exception:
                 log.debug("run %s: still failing", self.run, exc_info=True)
+
+    def _went_well(self) -> None:
+        self._rest_s = _REST_S[0]
         self._status = replace(self._status, error="")
 
     def _tell_stopped(self) -> None:
         self._tell("stopped", "The run is stopped. It can be started again where it was.")
 
     def _tell(self, phase: str, message: str, stats: dict | None = None) -> None:
+        if self._status.error and phase not in ("failed", "stopped"):
+            return  # what failed is tried again, and has not gone well yet
         learner = self._learner
         self._status = replace(
             self._status,
@@ -405,10 +411,10 @@ class Trainer:
     # Files
 
     def _load_snapshot(self) -> None:
-        """The newest snapshot that the database knows and the disk holds."""
+        """The newest snapshot that the database knows and the disk holds whole."""
         for row in reversed(self.store.snapshots(self.run)):
-            file = snapshot_file(self.directory, row["number"])
-            if file.exists():
+            with suppress(UserError):
+                file = snapshot_file(self.directory, row["number"])
                 self._snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]
                 return

@@ -21,7 +21,7 @@ import torch
 
 from trainer.appearance import Track
 from trainer.errors import UserError
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.store import RatedSegment
 
 CLASSES = 5
@@ -202,8 +202,15 @@ class Snapshot(ABC):
 
     @staticmethod
     def load(path: Path, device: str = "cpu") -> Snapshot:
-        """Reads what ``save`` wrote, onto a torch device; runs no code from the file."""
-        data = torch.load(path, weights_only=True, map_location="cpu")
+        """Reads what ``save`` wrote, onto a torch device; runs no code from the file.
+
+        Raises:
+            UserError: If there is no such file, or it is damaged, and was set aside.
+        """
+        content = read_whole(path)
+        if content is None:
+            raise UserError(f"the predictor {path} is missing or damaged")
+        data = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
         # Snapshots of before there were several kinds are the paper's network.
         settings = {"kind": "network", "members": 1, "appearance": False} | data["config"]
         module = importlib.import_module(KINDS[settings["kind"]])

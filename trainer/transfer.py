@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trainer.errors import UserError
-from trainer.files import write_atomic
+from trainer.files import read_whole, write_atomic
 from trainer.store import Store
 
 _KEPT = "start.pt"
@@ -29,11 +29,11 @@ def newest_snapshot(store: Store, data_dir: Path, run: str) -> Path:
     runs = [entry["id"] for entry in store.runs()]
     if run not in runs:
         raise UserError(f"no run {run!r} to start from; there are: {', '.join(runs) or 'none'}")
-    files = [snapshot_file(data_dir / "runs" / run, row["number"]) for row in store.snapshots(run)]
-    there = [file for file in files if file.exists()]
-    if not there:
-        raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
-    return there[-1]
+    for row in reversed(store.snapshots(run)):
+        file = snapshot_file(data_dir / "runs" / run, row["number"])
+        if read_whole(file) is not None:
+            return file
+    raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
 
 
 def snapshot_file(directory: Path, number: int) -> Path:

@@ -105,19 +105,21 @@ class Tab:
             raise RuntimeError(f"no command has the key {key!r}; there are {', '.join(self.keys)}")
         await self._say({"type": "CommandTriggerMessage", "uuid": self.keys[key]})
 
-    async def until(self, condition: Callable[[], object], what: str) -> None:
+    async def until(
+        self, condition: Callable[[], object], what: str, patience_s: float = _PATIENCE_S
+    ) -> None:
         """Waits until the page is in some state.
 
         Raises:
             RuntimeError: If it does not come to it, or the connection ends.
         """
-        end = time.monotonic() + _PATIENCE_S
+        end = time.monotonic() + patience_s
         while not condition():
             self._changed.clear()
             try:
                 await asyncio.wait_for(self._changed.wait(), end - time.monotonic())
             except TimeoutError:
-                raise RuntimeError(f"waited {_PATIENCE_S:.0f} s in vain for {what}") from None
+                raise RuntimeError(f"waited {patience_s:.0f} s in vain for {what}") from None
             if self._reader.done():
                 raise RuntimeError(f"the page ended its connection before {what}")
 
