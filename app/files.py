@@ -10,6 +10,7 @@ from aiohttp import web
 
 from app import assets
 from app.pictures import Pictures
+from trainer.errors import UserError
 from trainer.store import Store
 
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
@@ -95,6 +96,8 @@ class Files:
             path = await asyncio.to_thread(self._page.trainer.rollout_file, iteration, suffix)
         except FileNotFoundError:
             raise web.HTTPNotFound() from None
+        except UserError as error:  # nothing can be drawn here
+            raise web.HTTPServiceUnavailable(text=str(error)) from None
         kind = {"jpg": "image/jpeg", "webm": "video/webm"}[suffix]
         return web.FileResponse(path, headers=_KEEP | {"Content-Type": kind})
 

@@ -54,13 +54,13 @@ def serve(
         compare: Whether annotators are asked pairs, too.
 
     Raises:
-        UserError: If the data directory, the port or the graphics library cannot be used.
+        UserError: If the data directory or the port cannot be used.
     """
     listening.ssl_context()  # before anything is written
     check_port(listening.host, listening.port)
     sys.setswitchinterval(_SWITCH_SECONDS)
     store = Store(data_dir)
-    renderer = RenderThread()
+    renderer = RenderThread(at_once=False)  # the page says what is wrong
     secret = read_secret(data_dir)
     wanted = config if explicit else None
     found = None if new_run else find_run(store, data_dir, demo, name=run, wanted=wanted)

@@ -15,6 +15,7 @@ import pytest
 from test_loop import make_trainer, rate_all, wait_for
 from worlds import falling_demo, small_config
 
+from trainer.bench.serving import serving
 from trainer.errors import UserError, in_words
 from trainer.store import Store
 
@@ -160,6 +161,31 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
             wait_for(lambda: trainer.status().phase == "online" and not trainer.status().error, 60)
         finally:
             trainer.stop()
+
+
+def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium):
+    settings = ["predictor.appearance=false", "ratings.queue=4"]
+    with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
+        (run,) = (row["id"] for row in store.runs())
+        wait_for(lambda: len(store.waiting_clips(run)) == 4, 60)
+        drawn = {clip.id for clip in store.waiting_clips(run)}
+        server.kill()
+        monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))  # no driver is there
+        with serving(tmp_path / "data") as server:
+            page = chromium.new_page()
+            page.goto(server.links["annotator"])
+            for _ in range(3):
+                clip = page.wait_for_selector(".od-clip > [data-clip][data-frame]", timeout=60_000)
+                number = clip.get_attribute("data-clip")
+                page.wait_for_timeout(600)
+                page.keyboard.press("4")
+                page.wait_for_selector(f".od-clip > [data-clip]:not([data-clip='{number}'])", timeout=60_000)
+            banner = page.wait_for_selector(".od-banner", timeout=60_000)
+            assert "no OpenGL driver" in banner.inner_text() and "apt-get install" in banner.inner_text()
+            assert "go on rating" in banner.inner_text()
+            page.close()
+            rated = {row[0] for row in server.rows("SELECT clip_id FROM events")}
+            assert len(rated) == 3 and rated <= drawn
 
 
 def test_errors_are_told_in_plain_words():

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from trainer.clips import compose_clip
+from trainer.errors import in_words
 from trainer.files import jpeg_fault, read_whole, write_atomic
 from trainer.records import Clip
 from trainer.render import Renderer, RenderThread
@@ -50,11 +51,11 @@ class ClipMaker:
         self.error = ""
         """Why the last clip could not be drawn, one sentence; "" if it could."""
 
-    def submit(self, clips: list[Clip]) -> list[Future[None]]:
+    def submit(self, clips: list[Clip]) -> None:
         """Queues clips; each becomes "ready" when its picture is on disk."""
-        return [
-            self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip)) for clip in clips
-        ]
+        for clip in clips:
+            future = self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip))
+            future.add_done_callback(lambda future, clip=clip: self._note(future, clip))
 
     def retry(self) -> None:
         """Queues the clips that failed once more, a few seconds after: a full disk may have room now."""
@@ -69,18 +70,19 @@ class ClipMaker:
         self.submit(self._store.waiting_clips(run, state="cut"))
 
     def _make(self, renderer: Renderer, clip: Clip) -> None:
-        try:
-            segment = self._store.segment(clip.id)
-            index, first = np.unique(
-                self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True
-            )
-            agent = renderer.render(segment.qpos[first])
-            demo = self._frames[index]
-            write_atomic(self._file(clip.id), compose_clip(demo, agent))
-            self._store.set_clip_state([clip.id], "ready")
-            self.error = ""
-        except Exception as error:
-            log.exception("clip %d could not be drawn", clip.id)
-            self.error = f"clip {clip.id} could not be drawn: {error}"
+        segment = self._store.segment(clip.id)
+        index, first = np.unique(self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True)
+        agent = renderer.render(segment.qpos[first])
+        write_atomic(self._file(clip.id), compose_clip(self._frames[index], agent))
+        self._store.set_clip_state([clip.id], "ready")
+
+    def _note(self, future: Future[None], clip: Clip) -> None:
+        if future.cancelled():
+            return
+        error, before = future.exception(), self.error
+        self.error = in_words(error) if error is not None else ""
+        if error is not None:
+            if self.error != before:  # once, not with every try
+                log.error("clip %d could not be drawn: %s", clip.id, self.error, exc_info=error)
             self._failed_at = time.monotonic()
             self._failed.append(clip)

@@ -50,7 +50,7 @@ def open_context(width: int, height: int) -> Any:
         if sys.platform == "linux" and not _libegl_loads():
             raise UserError(
                 "cannot draw the robot: the library libEGL.so.1 is not installed; "
-                "on Debian or Ubuntu run: apt-get install libegl1 libgl1-mesa-dri"
+                "on Debian or Ubuntu run: apt-get install libegl1 libgl1-mesa-dri, then start onedemo again"
             )
         raise UserError(
             f"cannot draw the robot: MUJOCO_GL={os.environ['MUJOCO_GL']} turns pictures off; "
@@ -64,8 +64,8 @@ def open_context(width: int, height: int) -> Any:
     except Exception as error:  # ImportError, RuntimeError or the window library's own, by backend
         raise UserError(
             "cannot draw the robot: no OpenGL driver that draws without a screen was found; "
-            "on Debian or Ubuntu run: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri "
-            f"({type(error).__name__} from MUJOCO_GL={os.environ.get('MUJOCO_GL', '')})"
+            "on Debian or Ubuntu run: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, then start "
+            f"onedemo again ({type(error).__name__} from MUJOCO_GL={os.environ.get('MUJOCO_GL', '')})"
         ) from error
     return context
 

@@ -10,10 +10,12 @@ Shapes: T pictures, q positions, H rows, W columns.
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,8 +25,11 @@ import mujoco
 import numpy as np
 
 from trainer.backdrop import Camera, backdrop
+from trainer.errors import UserError
 from trainer.gl import open_context
 from trainer.priority import give_way
+
+log = logging.getLogger("onedemo")
 
 WIDTH, HEIGHT = 480, 360
 """Size of one side of a clip, pixels."""
@@ -148,12 +153,13 @@ class RenderThread:
     Args:
         width: Pixels, even.
         height: Pixels, even.
+        at_once: Whether to raise if this machine cannot draw; otherwise each job does, until one can.
 
     Raises:
         UserError: If this machine cannot draw without a screen.
     """
 
-    def __init__(self, width: int = WIDTH, height: int = HEIGHT) -> None:
+    def __init__(self, width: int = WIDTH, height: int = HEIGHT, *, at_once: bool = True) -> None:
         self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[[Renderer], Any]] | None]
         self._jobs = queue.SimpleQueue()
         self._lock = threading.Lock()
@@ -163,7 +169,13 @@ class RenderThread:
             target=self._work, args=(width, height, started), name="render", daemon=True
         )
         self._thread.start()
-        started.result()
+        try:
+            started.result()
+        except Exception as error:
+            if at_once or not isinstance(error, UserError):
+                self.close()
+                raise
+            log.error("%s", error)
 
     def submit(self, job: Callable[[Renderer], T]) -> Future[T]:
         """Runs ``job(renderer)`` in the render thread, in the order of submission.
@@ -205,22 +217,20 @@ class RenderThread:
 
     def _work(self, width: int, height: int, started: Future[None]) -> None:
         give_way()  # before the driver starts threads of its own
-        try:
-            renderer = Renderer(width, height)
-        except BaseException as error:
-            started.set_exception(error)
-            return
-        started.set_result(None)
-        with renderer:
-            while (entry := self._jobs.get()) is not None:
+        with ExitStack() as stack:
+            renderer: Renderer | None = None
+            entry: tuple[Future[Any], Callable[[Renderer], Any]] | None = (started, lambda _: None)
+            while entry is not None:
                 future, job = entry
                 if self._closed:
                     future.cancel()
                 if future.set_running_or_notify_cancel():
                     try:
+                        renderer = renderer or stack.enter_context(Renderer(width, height))
                         future.set_result(job(renderer))
                     except BaseException as error:
                         future.set_exception(error)
+                entry = self._jobs.get()
 
 
 def _studio_model(path: Path, *, width: int, height: int) -> mujoco.MjModel:
