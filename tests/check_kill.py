@@ -38,6 +38,8 @@ _EARLY = 0.15
 """Share of kills while it starts."""
 _RATED = 0.8
 """Share of lives in which it is waited for a first rating."""
+_LONG = 4
+"""Times as long is the rest of some lives, in which the robot practises, too."""
 _PATIENCE_S = 20.0
 _SHOWN = ".od-clip > [data-src][data-clip][data-frame]"
 
@@ -166,7 +168,7 @@ async def one_life(
         end = time.monotonic() + (_PATIENCE_S if rng.random() < _RATED else 0)
         while ratings.given.total() == given and time.monotonic() < end:
             await asyncio.sleep(0.05)
-        await asyncio.sleep(rng.uniform(0.1, 3.0))
+        await asyncio.sleep(rng.uniform(0.1, 3.0) * (_LONG if rng.random() < 0.2 else 1))
     except TimeoutError:
         tally.notes.append("a start showed nothing within a minute")
     for somebody in people:
