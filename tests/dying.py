@@ -55,7 +55,7 @@ def arm(moment: str) -> None:
 
     def dying(*args, **kwargs):
         nonlocal calls
-        calls += not (name == "replace" and "checkpoint" not in str(args[1]))
+        calls += name != "replace" or Path(args[1]).name == "checkpoint.pt"
         if calls == call and not after:
             die()
         result = whole(*args, **kwargs)
