@@ -67,10 +67,14 @@ class Tally:
     notes: list[str] = field(default_factory=list)
 
     @property
+    def whole(self) -> bool:
+        """Whether nothing was lost, doubled or damaged, and everybody could rate."""
+        return not (self.lost or self.doubled or self.damaged or self.notes)
+
+    @property
     def kept(self) -> bool:
         """Whether every promise was."""
-        broken = self.lost or self.doubled or self.damaged or self.notes
-        return not broken and self.slowest_start_s < START_S
+        return self.whole and self.slowest_start_s < START_S
 
     def line(self) -> str:
         """The figures."""
@@ -218,7 +222,7 @@ async def check(data_dir: Path, kills: int, seed: int, *, browser_share: float =
             tally.in_browser += real
             await one_life(data_dir, [] if tally.kills else SETTINGS, rng, tally, ratings, person)
             compare(data_dir, tally, ratings)
-            if not tally.kept:
+            if not tally.whole:
                 break
     finally:
         if playwright is not None:
