@@ -11,6 +11,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from app.pair_desk import PairDesk
+from app.pictures import version_of
 from app.player import player_html
 from app.pressing import Pressing
 from app.rate_html import tools_html
@@ -35,6 +36,7 @@ class Compare(Pressing):
         self._desk = PairDesk(
             trainer.store, trainer.run, session.rater, page.pair_assignment, session.client.client_id
         )
+        self._version = version_of(trainer.store, trainer.run)
         self._message = ""
         self._keys: list[Any] = []
         self._keys_for: Any = None
@@ -74,7 +76,9 @@ class Compare(Pressing):
             self._put(self._top, top_html(count))
             self._put(
                 self._stage,
-                pair_html(pair, self._desk.upcoming, self._trainer.demo.fps, self._problem)
+                pair_html(
+                    pair, self._desk.upcoming, self._version, self._trainer.demo.fps, self._problem
+                )
                 if pair is not None else waiting_html(self._message, self._problem),
             )  # fmt: skip
             self._put(self._answers, answers_html() if pair is not None else "")
@@ -116,11 +120,12 @@ def top_html(count: int) -> str:
     )
 
 
-def pair_html(pair: int, upcoming: int | None, fps: float, problem: str) -> str:
+def pair_html(pair: int, upcoming: int | None, version: str, fps: float, problem: str) -> str:
     """The two robots with the video between them."""
-    ahead = f' data-ahead="/pairs/{upcoming}.jpg"' if upcoming is not None else ""
+    ahead = f' data-ahead="/pairs/{upcoming}.jpg?v={version}"' if upcoming is not None else ""
     player = player_html(
-        f"/pairs/{pair}.jpg", fps, "right", "left", "third", attributes=f'data-pair="{pair}"{ahead}',
+        f"/pairs/{pair}.jpg?v={version}", fps, "right", "left", "third",
+        attributes=f'data-pair="{pair}"{ahead}',
         captions={"right": "Left", "left": "The video", "third": "Right"},
     )  # fmt: skip
     trouble = f'<p class="od-problem" role="alert">{escape(problem)}</p>' if problem else ""

@@ -6,6 +6,7 @@ Both are made once, on first use, and kept encoded (a few megabytes).
 from __future__ import annotations
 
 import threading
+import zlib
 from collections.abc import Callable
 
 import cv2
@@ -14,10 +15,20 @@ import numpy as np
 from trainer.clips import compose_clip
 from trainer.demos import read_frames
 from trainer.records import Demo
+from trainer.store import Store
 
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640
 _CLIP_SECONDS = 0.3
+
+
+def version_of(store: Store, run: str) -> str:
+    """What the addresses of a run's pictures end in, as ``?v=``.
+
+    Browsers keep pictures for good, and clips of other data at the same address have the same numbers.
+    """
+    made = next(entry["created_at"] for entry in store.runs() if entry["id"] == run)
+    return f"{zlib.crc32(f'{run} {made}'.encode()):08x}"
 
 
 class Pictures:

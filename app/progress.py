@@ -50,22 +50,23 @@ def chosen(numbers: Sequence[int], most: int = _SHOWN) -> list[int]:
     return [numbers[round(last * (most - 1 - k) / (most - 1))] for k in range(most)]
 
 
-def gallery_html(rows: Sequence[dict], run: str) -> str:
+def gallery_html(rows: Sequence[dict], version: str) -> str:
     """The best rollout of some iterations: a filmstrip each, which opens as a video.
 
     Args:
         rows: Iterations, oldest first.
-        run: Whose; another run's are at other addresses, as browsers keep them.
+        version: Of the run's pictures, as ``pictures.version_of``.
     """
     best = {row["number"]: row["best"] for row in rows if row.get("best") is not None}
     if not best:
         return ""
     cards = "".join(
-        f'<li><button type="button" data-video="/rollouts/{number}.webm?v={run}" '
+        f'<li><button type="button" data-video="/rollouts/{number}.webm?v={version}" '
         f'aria-label="Play the best rollout of iteration {number}">'
-        f'<img src="/rollouts/{number}.jpg?v={run}" alt="" loading="lazy" width="960" height="120"></button>'
+        f'<img src="/rollouts/{number}.jpg?v={version}" alt="" loading="lazy" '
+        'width="960" height="120"></button>'
         f"<p><b>Iteration {number:,}</b> predicted rating {best[number]:.1f} "
-        f'<a href="/rollouts/{number}.webm?v={run}" download="onedemo-iteration-{number}.webm">'
+        f'<a href="/rollouts/{number}.webm?v={version}" download="onedemo-iteration-{number}.webm">'
         "Download video</a></p></li>"
         for number in chosen(list(best))
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from app import rate_html as html
 from app.desk import Desk
+from app.pictures import version_of
 from app.pressing import Pressing
 from app.words import ANSWERS, RATE_KEYS, keys_dialog
 from trainer.records import Status
@@ -30,7 +31,7 @@ class Rate(Pressing):
         page, trainer = session.page, session.page.trainer
         self._session = session
         self._store, self._run, self._fps = trainer.store, trainer.run, trainer.demo.fps
-        self._pictures = page.pictures
+        self._pictures, self._version = page.pictures, version_of(trainer.store, trainer.run)
         super().__init__(session.client)
         self.desk = Desk(
             trainer.store, trainer.run, session.rater, page.assignment, session.client.client_id,
@@ -116,12 +117,12 @@ class Rate(Pressing):
             # A mark is drawn by the browser; it is given back whenever the clip is drawn anew.
             if self._drawn != (clip, self._problem):
                 self._drawn, self._mark = (clip, self._problem), self.desk.mark
-            self._put(self._stage, html.clip_html(clip, self._fps, self._problem, self._mark))
+            self._put(self._stage, html.clip_html(clip, self._version, self._fps, self._problem, self._mark))
         else:
             self._put(self._stage, html.waiting_html(self._status, count, self._problem))
         self._put(self._tools, html.tools_html(rating=asking, can_undo=self.desk.can_undo))
         self._put(self._why, html.why_html(self.desk.skipped))
-        self._put(self._ahead, html.ahead_html(self.desk.upcoming))
+        self._put(self._ahead, html.ahead_html(self.desk.upcoming, self._version))
         self._show_answers(asking)
         self._set_keys(clip)
 

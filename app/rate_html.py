@@ -29,17 +29,23 @@ def top_html(count: int, target: int, *, asking: bool) -> str:
     )
 
 
-def clip_html(clip: int, fps: float, problem: str, mark: tuple[int, int] | None = None) -> str:
+def clip_html(clip: int, version: str, fps: float, problem: str, mark: tuple[int, int] | None = None) -> str:
     """The clip and its time bar, with what is marked on it: first picture, picture after the last."""
     marked = f' data-mark="{mark[0]},{mark[1]}"' if mark is not None else ""
     attributes = f'data-clip="{clip}"{marked}'
-    player = player_html(f"/clips/{clip}.jpg", fps, "left", "right", attributes=attributes)
+    player = player_html(_address(clip, version), fps, "left", "right", attributes=attributes)
     return f'<div class="od-clip">{player}{_BAR}</div>{_trouble(problem)}'
 
 
-def ahead_html(upcoming: int | None) -> str:
+def ahead_html(upcoming: int | None, version: str) -> str:
     """The next clip, to be fetched ahead; apart, so that the clip on screen is not drawn anew for it."""
-    return f'<i class="od-ahead" data-ahead="/clips/{upcoming}.jpg"></i>' if upcoming is not None else ""
+    if upcoming is None:
+        return ""
+    return f'<i class="od-ahead" data-ahead="{_address(upcoming, version)}"></i>'
+
+
+def _address(clip: int, version: str) -> str:
+    return f"/clips/{clip}.jpg?v={version}"
 
 
 _BAR = (

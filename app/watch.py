@@ -14,6 +14,7 @@ from mjviser import ViserMujocoScene
 
 from app import charts, progress
 from app.live import Moment
+from app.pictures import version_of
 from app.words import nobody_html
 from trainer.records import Status
 
@@ -53,6 +54,7 @@ class Watch:
         self._trainer = session.page.trainer
         self._live = session.page.live
         self._demo = self._trainer.demo
+        self._version = version_of(self._trainer.store, self._trainer.run)
         self._lock = threading.RLock()
         self._scene: ViserMujocoScene | None = None
         self._frame = -1
@@ -108,7 +110,7 @@ class Watch:
             self._charts.extend(new)
             if new:
                 self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
-                self._put(self._gallery, progress.gallery_html(self._charts.rows, self._trainer.run))
+                self._put(self._gallery, progress.gallery_html(self._charts.rows, self._version))
             self._put(
                 self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
             )

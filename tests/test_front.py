@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import re
+import time
+from contextlib import closing
 from pathlib import Path
 
 import aiohttp
@@ -17,8 +19,9 @@ from app.door import Door
 from app.front import Front, check_port
 from app.links import issue_link, read_secret
 from app.listening import Listening
+from app.pictures import version_of
 from trainer.errors import UserError
-from trainer.store import RATING_COLUMNS
+from trainer.store import RATING_COLUMNS, Store
 
 pytestmark = pytest.mark.seam
 
@@ -249,3 +252,16 @@ def test_a_host_that_cannot_be_listened_on(site, host, port):
         check_port(host, port)
     with pytest.raises(UserError, match="cannot be opened"):
         Front(site.page, Listening(host=host, port=port, behind_proxy=True)).start()
+
+
+def test_pictures_of_other_data_have_other_addresses(tmp_path):
+    """Browsers keep a picture for good, and every data directory has a clip 1."""
+    versions = set()
+    for name in ("a", "b"):
+        with closing(Store(tmp_path / name)) as store:
+            for run in ("r", "s"):
+                store.add_run(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
+            versions |= {version_of(store, "r"), version_of(store, "s")}
+            assert version_of(store, "r") == version_of(store, "r")
+        time.sleep(0.002)
+    assert len(versions) == 4

@@ -22,7 +22,7 @@ import msgspec
 import zstandard
 
 _CLIP = re.compile(r'data-clip="(\d+)"')
-_AHEAD = re.compile(r'data-ahead="/clips/(\d+)\.jpg"')
+_AHEAD = re.compile(r'data-ahead="/clips/(\d+)\.jpg\b')
 _WAITING = 'class="od-waiting"'
 _SIZES = 16
 """Bytes before the compressed part of a message: its size when unpacked, and as it is."""
