@@ -64,6 +64,7 @@ def test_same_seed_same_training():
     assert a.best_score.reward_mean != c.best_score.reward_mean
 
 
+@pytest.mark.slow
 def test_backflips_begin_within_16_thousand_steps():
     """Not yet turns, but falling over backwards and kicking: twice the untrained reward."""
     untrained = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=250, seed=0)

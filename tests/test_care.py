@@ -71,6 +71,7 @@ def files(directory):
     }
 
 
+@pytest.mark.slow
 def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
     counts = back_up(data_dir, tmp_path / "all.zip")
     assert stat.S_IMODE((tmp_path / "all.zip").stat().st_mode) == 0o600
@@ -121,6 +122,7 @@ def test_ratings_may_come_while_a_backup_is_made(data_dir, tmp_path):
         assert store.last_event() > before + 10
 
 
+@pytest.mark.slow
 def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir, demo, caplog):
     """A run that has lost its last checkpoint and its last predictor makes both again, to the bit."""
     snapshot = newest(data_dir)
@@ -340,6 +342,7 @@ def test_the_doctor_names_what_is_wrong(data_dir, capsys, harm, said):
     assert any(re.search(said, line) for line in wrong), wrong
 
 
+@pytest.mark.slow
 def test_the_doctor_says_when_nothing_can_be_drawn(tmp_path):
     command = [sys.executable, "-m", "app.cli", "doctor", "--data-dir", str(tmp_path / "none")]
     child = subprocess.run(command, env=os.environ | {"MUJOCO_GL": "off"}, capture_output=True, text=True)

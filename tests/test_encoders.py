@@ -170,6 +170,7 @@ def vgg16_file(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_vgg16_loads_a_file_and_gives_its_last_4096_after_relu(vgg16_file, frames):
     encoder = make_encoder("vgg16", vgg16_file)
     assert encoder.name.startswith("vgg16-") and encoder.dims == 4096

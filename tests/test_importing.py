@@ -115,6 +115,7 @@ def damaged(text, lines):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault", ["a rating of 9", "an unknown clip", "the same twice", "no header", "not a number"]
 )

@@ -214,6 +214,7 @@ def test_the_method_asks_about_random_states_beside_any_moment(features):
         assert q.demo_step == standing.clock[q.lane, q.start]
 
 
+@pytest.mark.slow
 def test_with_a_predictor_it_asks_about_better_clips(features, by_distance):
     learner = make_learner(features, onedemo())
     first = asked(learner, by_distance, 60)
@@ -271,6 +272,7 @@ def test_of_another_body_it_sees_pictures_and_imagines_poses(features):
     assert 1 <= stats["predicted"] <= 5
 
 
+@pytest.mark.slow
 def test_practice_follows_the_predictor(features, by_distance):
     """Starts from its bank, a clock that waits and hurries, episodes given up; rewards of all that."""
     learner = make_learner(features, onedemo(rollouts__lanes=32, rollouts__steps=100))
@@ -333,6 +335,7 @@ def test_a_policy_is_summarised_before_there_is_a_predictor(features):
     assert summary["predicted_similarity"] is None and summary["net_turns"]["mean"] == 0
 
 
+@pytest.mark.slow
 def test_evaluation_uses_the_elastic_clock(features, by_distance):
     learner = make_learner(features, onedemo())
     snapshot, _ = learner.fit(asked(learner, by_distance, 30), 1)

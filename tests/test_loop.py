@@ -142,6 +142,7 @@ def test_a_stopped_run_goes_on_where_it_was(store, demo):
     assert numbers == list(range(1, len(numbers) + 1))
 
 
+@pytest.mark.slow
 def test_people_rate_and_the_trainer_follows(store, demo):
     ann = store.ensure_rater("Ann", "annotator")
     trainer_ = make_trainer(store, demo, config=small_config(rollouts__total_steps=10**6))
@@ -477,6 +478,7 @@ def flat(tree):
     return [x for branch in (tree.values() if isinstance(tree, dict) else tree) for x in flat(branch)]
 
 
+@pytest.mark.slow
 def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_path):
     """With the hidden states replaced by noise, the same ratings give the same policy."""
     learns_the_same_from_noise(demo, tmp_path, small_config())

@@ -106,6 +106,7 @@ def test_it_ranks_unseen_clips_as_the_true_distance_does(fitted, rollouts, view)
     assert np.corrcoef(value, truth)[0, 1] > 0.9
 
 
+@pytest.mark.slow
 def test_a_few_ratings_do(rollouts, view):
     unseen, unseen_frames, distance = world(rollouts, view, 300, seed=1)
     ranks = []

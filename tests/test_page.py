@@ -174,6 +174,21 @@ def test_held_key_gives_one_rating(chromium, site):
         assert site.events() == [("rate", clip, 5, "bo")]
 
 
+def test_the_next_clip_is_fetched_before_the_press(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        for _ in range(2):
+            shown_clip(page)
+            ahead = page.locator(".od-ahead").get_attribute("data-ahead", timeout=10_000)
+
+            def fetched(ahead=ahead):
+                loaded = page.evaluate("performance.getEntriesByType('resource').map(entry => entry.name)")
+                return [name for name in loaded if name.endswith(ahead)]
+
+            assert until(fetched)
+            press_and_wait(page, site, lambda: page.keyboard.press("3"))
+            assert page.locator(".od-clip .od-player").get_attribute("data-src") == ahead
+
+
 def test_undo_and_skip(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         first = shown_clip(page)

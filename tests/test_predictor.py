@@ -109,6 +109,7 @@ def test_it_learns_a_rule_of_frame_and_state(visual):
     assert np.corrcoef(blind, truth)[0, 1] < 0.6
 
 
+@pytest.mark.slow
 def test_same_ratings_and_seed_give_the_same_predictor(visual):
     ratings, frames = world(40, seed=0)
     one, _ = fit(ratings, frames, visual, QUICK, number=1, seed=5)

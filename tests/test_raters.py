@@ -149,6 +149,7 @@ def run(store, demo, rater, **config):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_declined_clips_are_skipped_and_others_asked(store, tmp_path):
     world = falling_demo(tmp_path / "demo")
     summary = run(store, world, "oracle+skip:0.6")

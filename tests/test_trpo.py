@@ -319,6 +319,7 @@ def test_a_state_saved_before_the_fused_optimiser_goes_on_fused():
     assert fresh.state_dict()["adam"]["param_groups"][0]["fused"] is True
 
 
+@pytest.mark.slow
 def test_same_seed_same_policy_and_resumed_training_is_the_same():
     policy, *_ = hopper(3, 4, lanes=4, steps=100)
     again, trpo, collector, _ = hopper(3, 2, lanes=4, steps=100)

@@ -21,6 +21,8 @@ from trainer.trpo import Trpo, TrpoConfig
 
 pytest.importorskip("mujoco_warp", reason="the extra 'warp' is not installed: pip install 'onedemo[warp]'")
 
+pytestmark = pytest.mark.slow  # its kernels are compiled first
+
 LANES = 96
 POSITIONS, VELOCITIES = 5e-6, 5e-5
 
@@ -83,7 +85,6 @@ def own_jump(qpos, qvel, action):
     return np.abs(after - after[0])[:, 7:].max()
 
 
-@pytest.mark.slow
 def test_each_step_agrees_with_the_processor(ours, states):
     """Every lane within tolerance, unless a contact sets in or not: the processor's answer jumps too."""
     theirs = started(envs.make("hopper", LANES, nthread=0), states)
@@ -104,7 +105,6 @@ def test_each_step_agrees_with_the_processor(ours, states):
     assert beyond < 5
 
 
-@pytest.mark.slow
 def test_trajectories_agree_as_long_as_chaos_lets_them(ours, states):
     theirs = started(envs.make("hopper", LANES, nthread=0), states)
     started(ours, states)
@@ -118,7 +118,6 @@ def test_trajectories_agree_as_long_as_chaos_lets_them(ours, states):
         np.testing.assert_array_less(seen[step], np.multiply(bound, [5e-7, 1e-6, 2e-6, 5e-6]))
 
 
-@pytest.mark.slow
 def test_a_lane_depends_on_its_own_state_alone(ours, states):
     """Not on what it did before, nor on its neighbours, nor on how many they are: to the last bit."""
     action = actions_for(5, LANES, 1)[0]
