@@ -10,6 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from app.parquet import write_segments
+from trainer.files import replacing
 from trainer.store import RATING_COLUMNS, Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -63,10 +64,5 @@ def write_parquet(store: Store, run: str | None, file: Path) -> int:
     """
     runs = [entry for entry in store.runs() if run in (None, entry["id"])]
     roles = {rater.name: rater.role for rater in store.raters()}
-    half = file.with_name(f".{file.name}.half")
-    try:
-        count = write_segments(half, store.rated_clips(run), runs, roles)
-        half.replace(file)
-    finally:
-        half.unlink(missing_ok=True)
-    return count
+    with replacing(file) as half:
+        return write_segments(half, store.rated_clips(run), runs, roles)

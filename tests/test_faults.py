@@ -158,7 +158,8 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
                     seen.add((trainer.status().phase, bool(trainer.status().error)))
                     time.sleep(0.002)
                 assert seen == {("failed", True)}
-            wait_for(lambda: trainer.status().phase == "online" and not trainer.status().error, 60)
+            wait_for(lambda: not trainer.status().error, 60)
+            assert trainer.status().phase == "online"
         finally:
             trainer.stop()
 

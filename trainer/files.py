@@ -30,19 +30,35 @@ def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
     Raises:
         OSError: If the disk is full or the directory not writable; the old file is then untouched.
     """
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        for block in (data,) if isinstance(data, bytes) else data:
+            file.write(block)
+
+
+@contextmanager
+def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
+    """A temporary name for a file that is written by others: synced and renamed when the block ends well.
+
+    Args:
+        path: Where; missing directories are made.
+        suffix: What the temporary name ends in, for writers that go by it.
+
+    Raises:
+        OSError: As ``write_atomic``.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=suffix)
+    temporary = Path(name)
     try:
-        with os.fdopen(handle, "wb") as file:
-            os.fchmod(handle, 0o666 & ~_UMASK)  # mkstemp makes files that nobody else can read
-            for block in (data,) if isinstance(data, bytes) else data:
-                file.write(block)
-            file.flush()
-            os.fsync(file.fileno())
+        os.fchmod(handle, 0o666 & ~_UMASK)  # mkstemp makes files that nobody else can read
+        yield temporary
+        os.fsync(handle)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink(missing_ok=True)
         raise
+    finally:
+        os.close(handle)
     directory = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(directory)  # the rename itself must survive a power cut
@@ -79,7 +95,7 @@ def read_whole(path: Path, fault: Callable[[bytes], str] = archive_fault) -> byt
         return None
     if found := fault(data):
         os.replace(path, path.with_name(f"{path.name}.damaged"))
-        log.warning("%s is damaged (%s): set aside as %s.damaged, and made anew", path, found, path.name)
+        log.warning("%s is damaged (%s): set aside as %s.damaged", path, found, path.name)
         return None
     return data
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 
 from trainer.clips import side_by_side
 from trainer.demos import read_frames
-from trainer.files import read_whole, write_atomic
+from trainer.files import read_whole, replacing, write_atomic
 from trainer.predictor import Snapshot
 from trainer.records import Demo, Rollouts
 from trainer.render import Renderer, RenderThread
@@ -221,9 +220,5 @@ def write_video(
             for t, robot in zip(some, renderer.render(qpos[some]), strict=True):
                 yield side_by_side(demo[frames[t]], robot)
 
-    half = file.with_name(f".half-{os.getpid()}-{file.name}")
-    try:
+    with replacing(file, ".webm") as half:
         write_webm(half, pairs(), fps=fps)
-        half.replace(file)
-    finally:
-        half.unlink(missing_ok=True)

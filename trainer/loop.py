@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -29,7 +28,8 @@ from trainer.clipmaker import ClipMaker
 from trainer.config import RunConfig
 from trainer.demos import read_frames
 from trainer.encoders import Encoder, demo_features
-from trainer.errors import UserError, in_words
+from trainer.errors import in_words
+from trainer.files import read_whole
 from trainer.learner import Learner
 from trainer.motion import TASK_REWARDS
 from trainer.pairing import Pairing
@@ -124,6 +124,7 @@ class Trainer:
             pretrain_ratings=config.ratings.pretrain,
             target_ratings=self._asking.target,
         )
+        self._held_back = self._status
 
     # What other threads may call
 
@@ -389,16 +390,15 @@ class Trainer:
 
     def _went_well(self) -> None:
         self._rest_s = _REST_S[0]
-        self._status = replace(self._status, error="")
+        if self._status.error:
+            self._status = replace(self._held_back, error="")
 
     def _tell_stopped(self) -> None:
         self._tell("stopped", "The run is stopped. It can be started again where it was.")
 
     def _tell(self, phase: str, message: str, stats: dict | None = None) -> None:
-        if self._status.error and phase not in ("failed", "stopped"):
-            return  # what failed is tried again, and has not gone well yet
         learner = self._learner
-        self._status = replace(
+        told = replace(
             self._status,
             phase=phase,
             message=message,
@@ -407,14 +407,18 @@ class Trainer:
             snapshot=self._snapshot.number if self._snapshot else 0,
             steps_per_s=stats["steps_per_s"] if stats else self._status.steps_per_s,
         )
+        if self._status.error and phase not in ("failed", "stopped"):
+            self._held_back = told  # what failed is tried again, and has not gone well yet
+        else:
+            self._status = told
 
     # Files
 
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds whole."""
         for row in reversed(self.store.snapshots(self.run)):
-            with suppress(UserError):
-                file = snapshot_file(self.directory, row["number"])
+            file = snapshot_file(self.directory, row["number"])
+            if read_whole(file) is not None:
                 self._snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]
                 return

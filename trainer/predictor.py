@@ -21,7 +21,7 @@ import torch
 
 from trainer.appearance import Track
 from trainer.errors import UserError
-from trainer.files import read_whole, write_atomic
+from trainer.files import archive_fault, write_atomic
 from trainer.store import RatedSegment
 
 CLASSES = 5
@@ -205,11 +205,11 @@ class Snapshot(ABC):
         """Reads what ``save`` wrote, onto a torch device; runs no code from the file.
 
         Raises:
-            UserError: If there is no such file, or it is damaged, and was set aside.
+            UserError: If it is damaged.
         """
-        content = read_whole(path)
-        if content is None:
-            raise UserError(f"the predictor {path} is missing or damaged")
+        content = path.read_bytes()
+        if fault := archive_fault(content):
+            raise UserError(f"the predictor {path} is damaged ({fault}): restore it from a backup")
         data = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
         # Snapshots of before there were several kinds are the paper's network.
         settings = {"kind": "network", "members": 1, "appearance": False} | data["config"]

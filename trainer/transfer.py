@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from trainer.errors import UserError
-from trainer.files import read_whole, write_atomic
+from trainer.files import archive_fault, write_atomic
 from trainer.store import Store
 
 _KEPT = "start.pt"
@@ -29,11 +29,14 @@ def newest_snapshot(store: Store, data_dir: Path, run: str) -> Path:
     runs = [entry["id"] for entry in store.runs()]
     if run not in runs:
         raise UserError(f"no run {run!r} to start from; there are: {', '.join(runs) or 'none'}")
-    for row in reversed(store.snapshots(run)):
+    rows = store.snapshots(run)
+    if not rows:
+        raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
+    for row in reversed(rows):
         file = snapshot_file(data_dir / "runs" / run, row["number"])
-        if read_whole(file) is not None:
+        if file.exists() and not archive_fault(file.read_bytes()):
             return file
-    raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
+    raise UserError(f"run {run!r} has no similarity predictor left: its files are missing or damaged")
 
 
 def snapshot_file(directory: Path, number: int) -> Path:
