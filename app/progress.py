@@ -30,6 +30,8 @@ def timeline_html(rows: Sequence[dict], seconds: float) -> str:
     if known:
         weakest = seconds * (parts.index(min(known)) + 0.5) / len(parts)
         told = f"between {min(known):.1f} and {max(known):.1f}; weakest at {weakest:.1f} s"
+        if missing := parts.count(None):
+            told += f"; {seconds * missing / len(parts):.1f} s not reached (dashed)"
     else:
         told = "no part was reached"
     return (

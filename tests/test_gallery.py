@@ -85,7 +85,7 @@ def test_the_best_rollout_is_drawn_when_asked_for_and_once(tmp_path):
 def test_the_strip_names_the_weakest_part_and_what_was_not_reached():
     rows = [{"number": 1, "timeline": [1.0, 3.0, 2.0, None]}, {"number": 2}]
     html = timeline_html(rows, 8.0)
-    assert "iteration 1; between 1.0 and 3.0; weakest at 1.0 s" in html
+    assert "iteration 1; between 1.0 and 3.0; weakest at 1.0 s; 2.0 s not reached (dashed)" in html
     assert html.count("<i style=") == 3 and "6.0 to 8.0 s: not reached" in html and "--od-rated:50%" in html
     assert "no part was reached" in timeline_html([{"number": 1, "timeline": [None]}], 8.0)
     assert "iteration" not in timeline_html([], 8.0)
