@@ -184,7 +184,8 @@ def runs_html(
         "is lost.</p></div></div>"
         '<section><div class="od-scroll" tabindex="0" role="region" aria-label="Runs">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
-        "<h2>Compare</h2><p class=od-quiet>Tick a run in the column Compare, or write a part of its name.</p></article>"
+        "<h2>Compare</h2><p class=od-quiet>Tick a run in the column Compare, or write a part of its name."
+        "</p></article>"
     )
 
 
