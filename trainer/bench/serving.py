@@ -300,7 +300,10 @@ async def stocked(data_dir: Path, *, presses: int, people: int) -> AsyncIterator
         people: How many there will be at once, at most.
     """
     # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
-    settings = ["ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000"]
+    settings = [
+        "ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000",
+        "rollouts.total_steps=1000000000",
+    ]  # fmt: skip
     with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
         before = store.last_event()
         async with browser_session() as session:
