@@ -16,15 +16,15 @@ run: .venv/.installed
 
 setup: .venv/.installed
 
-# Side by side on two cores; the fast ones first, which say most in the least time.
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup
+# The first side by side on two cores; those with servers and browsers want both cores for themselves.
+SIDE_BY_SIDE := -n 2 --dist loadgroup
 
 test: .venv/.installed-test
-	$(PYTEST) -m "not seam"
-	$(PYTEST) -m seam
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not seam"
+	$(BIN)/python -m pytest -m seam
 
 test-fast: .venv/.installed-test
-	$(PYTEST) -m "not seam and not slow"
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not seam and not slow"
 
 check: .venv/.installed-test
 	$(BIN)/ruff check .

@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from trainer.config import METHODS, RunConfig, load_config
+from trainer.config import METHODS, RunConfig, load_config, settings_for_another
 from trainer.demos import find_demo
 from trainer.encoders import make_encoder
 from trainer.errors import UserError
@@ -97,6 +97,8 @@ class Study:
     ) -> str:
         """Makes a run and serves it; returns its name.
 
+        It has the settings of the run at hand, as far as its method is the same.
+
         Args:
             demo: What is to be learned.
             method: "onedemo" or "paper".
@@ -110,7 +112,8 @@ class Study:
         with self._change:
             if method not in METHODS:
                 raise UserError(f"there is no method {method!r}; choose from: {', '.join(METHODS)}")
-            config = load_config(None, {"method": method, "seed": seed, "device": self._device})
+            kept = settings_for_another(self.trainer.config, method)
+            config = load_config(None, kept | {"seed": seed, "device": self._device})
             start = None
             if predictor_from is not None:
                 start = newest_snapshot(self._store, self._data_dir, predictor_from)

@@ -2,7 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from trainer.config import METHODS, RunConfig, load_config, parse_override, to_toml
+from trainer.config import (
+    METHODS,
+    RunConfig,
+    load_config,
+    parse_override,
+    settings_for_another,
+    to_toml,
+)
 from trainer.errors import UserError
 
 
@@ -160,3 +167,17 @@ def test_a_run_with_a_method_is_recorded_whole(tmp_path, method):
 def test_numbers_are_finite(value):
     with pytest.raises(UserError, match=r"practice\.slack_seconds must be a finite number"):
         load_config(None, {"practice.slack_seconds": value})
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_another_run_has_the_settings_of_the_one_at_hand(method):
+    changed = {"ratings.pretrain": 7, "trpo.max_kl": 0.02, "seed": 3}
+    told = load_config(None, {"method": "paper", "ratings.choice": "high"} | changed)
+    config = load_config(None, settings_for_another(told, method))
+    own = {"ratings.choice": "high"} if method == "paper" else {}
+    assert config == load_config(None, {"method": method} | own | changed)
+
+
+def test_a_setting_of_a_section_leaves_the_others_as_they_were():
+    """The sections' own defaults are not always those of a run."""
+    assert load_config(None, {"policy.log_std": -0.5}).policy.kind == load_config().policy.kind == "table"

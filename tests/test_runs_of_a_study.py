@@ -60,6 +60,7 @@ def test_another_run_is_opened_and_the_one_before_is_free(study):
 def test_a_run_starts_from_the_predictor_of_another(study):
     run = study.create(demo="falling", method="paper", seed=3, name="third", predictor_from="second")
     assert run == study.trainer.run == "third" and study.trainer.config.seed == 3
+    assert study.trainer.config.ratings == small_config().ratings  # as the server was told
     newest = max(study.trainer.data_dir.glob("runs/second/snapshots/*.pt"))
     study.trainer.stop()
     assert (study.trainer.directory / "start.pt").read_bytes() == newest.read_bytes()

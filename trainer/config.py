@@ -163,7 +163,19 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     for dotted, value in METHODS.get(str(tree.get("method")), {}).items():
         branch, key = _place(tree, dotted)
         branch.setdefault(key, value)
-    return _build(RunConfig, tree, "")
+    return _build(RunConfig(), tree, "")
+
+
+def settings_for_another(config: RunConfig, method: str) -> dict[str, Any]:
+    """A run's settings as overrides for ``load_config``; for another method those that none decides."""
+    decided = set() if method == config.method else set().union(*METHODS.values())
+    flat: dict[str, Any] = {}
+    for name, value in tomllib.loads(to_toml(config)).items():
+        if isinstance(value, dict):
+            flat |= {f"{name}.{key}": each for key, each in value.items()}
+        else:
+            flat[name] = value
+    return {key: value for key, value in flat.items() if key not in decided} | {"method": method}
 
 
 def _place(tree: dict[str, Any], dotted: str) -> tuple[dict[str, Any], str]:
@@ -214,8 +226,8 @@ def _toml_value(value: Any) -> str:
     return repr(value)
 
 
-def _build(kind: type[T], tree: dict[str, Any], prefix: str) -> T:
-    hints = get_type_hints(kind)
+def _build(default: T, tree: dict[str, Any], prefix: str) -> T:
+    hints = get_type_hints(type(default))
     known: dict[str, Any] = {}
     for key, value in tree.items():
         if key not in hints:
@@ -225,11 +237,11 @@ def _build(kind: type[T], tree: dict[str, Any], prefix: str) -> T:
         if dataclasses.is_dataclass(hint):
             if not isinstance(value, dict):
                 raise UserError(f"{prefix + key} is a section, not a value")
-            known[key] = _build(hint, value, f"{prefix}{key}.")  # type: ignore[arg-type]
+            known[key] = _build(getattr(default, key), value, f"{prefix}{key}.")
         else:
             known[key] = _fit(prefix + key, value, hint)
     try:
-        return kind(**known)
+        return dataclasses.replace(default, **known)  # type: ignore[type-var]
     except ValueError as error:
         raise UserError(str(error)) from None
 
