@@ -21,11 +21,6 @@ from trainer.store import Store
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
 
-
-class AnsweredElsewhere(Exception):
-    """What was pressed at a page is answered already, by the same person at another page."""
-
-
 Mark = tuple[float, float]
 """Where a clip goes wrong: its first picture, and the picture after the last; whole numbers."""
 
@@ -113,7 +108,6 @@ class Desk:
             False if the press counts for nothing.
 
         Raises:
-            AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
             sqlite3.Error: If it could not be committed; the clip stays.
         """
         with self._lock:
@@ -207,9 +201,10 @@ class Desk:
         in_time = self._clock() - self._shown_at >= GUARD_SECONDS
         ask = self._current if clip == self.current and in_time else None
         if ask is not None and self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat):
+            # The same person has answered it at another page meanwhile.
             self._assignment.release(self._holder, ask.clip)
             self._advance()
-            raise AnsweredElsewhere("You had rated that clip at another page of yours: that answer stands.")
+            return None
         return ask
 
     def _latency_ms(self) -> int:
