@@ -1,6 +1,7 @@
 """Backup, restore and doctor, on data that real runs made, with files that are really damaged."""
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -14,8 +15,10 @@ import zipfile
 from contextlib import closing
 
 import aside
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from test_demos import make_video
 from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
@@ -26,9 +29,10 @@ from trainer.asking import Simulated
 from trainer.backup import MANIFEST, back_up, restore
 from trainer.bench.annotators import browser_session, open_tab, rating
 from trainer.bench.serving import reach, serving
+from trainer.clips import compose_clip
 from trainer.demos import import_video
 from trainer.errors import UserError
-from trainer.files import archive_fault, jpeg_fault, read_whole
+from trainer.files import archive_fault, jpeg_fault, read_whole, sealed
 from trainer.predictor import Snapshot
 from trainer.store import FILE_NAME, Store
 
@@ -148,9 +152,18 @@ def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir
             torch.testing.assert_close(again[name], tensor, rtol=0, atol=0)
 
 
-def test_a_damaged_picture_is_drawn_again(tmp_path):
-    file = tmp_path / "000001.jpg"
-    file.write_bytes(b"\xff\xd8 and no end")
+@pytest.mark.parametrize("at", [None, 0.001, 0.003, 0.99])  # cut off, or turned: in the seal, the rest
+def test_a_damaged_picture_is_set_aside(tmp_path, at):
+    frames = np.random.default_rng(0).integers(0, 255, (2, 3, 36, 48, 3), np.uint8)
+    plain, file = compose_clip(*frames), tmp_path / "000001.jpg"
+    file.write_bytes(sealed(plain))
+    assert read_whole(file, jpeg_fault) == sealed(plain) and jpeg_fault(plain) == ""
+    with Image.open(io.BytesIO(plain)) as one, Image.open(file) as other:
+        assert one.tobytes() == other.tobytes()  # nobody else sees the seal
+    if at is None:
+        file.write_bytes(sealed(plain)[:-40])
+    else:
+        flip(file, at)
     assert read_whole(file, jpeg_fault) is None
     assert not file.exists() and (tmp_path / "000001.jpg.damaged").exists()
 

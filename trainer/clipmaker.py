@@ -12,7 +12,7 @@ import numpy as np
 
 from trainer.clips import compose_clip
 from trainer.errors import in_words
-from trainer.files import jpeg_fault, read_whole, write_atomic
+from trainer.files import jpeg_fault, read_whole, sealed, write_atomic
 from trainer.records import Clip
 from trainer.render import Renderer, RenderThread
 from trainer.store import Store
@@ -73,7 +73,7 @@ class ClipMaker:
         segment = self._store.segment(clip.id)
         index, first = np.unique(self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True)
         agent = renderer.render(segment.qpos[first])
-        write_atomic(self._file(clip.id), compose_clip(self._frames[index], agent))
+        write_atomic(self._file(clip.id), sealed(compose_clip(self._frames[index], agent)))
         self._store.set_clip_state([clip.id], "ready")
 
     def _note(self, future: Future[None], clip: Clip) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from trainer.clips import side_by_side
 from trainer.demos import read_frames
-from trainer.files import read_whole, replacing, write_atomic
+from trainer.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
 from trainer.predictor import Snapshot
 from trainer.records import Demo, Rollouts
 from trainer.render import Renderer, RenderThread
@@ -156,7 +156,7 @@ class Gallery:
             FileNotFoundError: If none was kept.
         """
         file = self._file(iteration, suffix)
-        if file.exists():
+        if file.exists() and (suffix != "jpg" or read_whole(file, jpeg_fault)):
             return file
         kept = read_whole(self._file(iteration, "npz"))
         if kept is None:
@@ -164,7 +164,8 @@ class Gallery:
         with np.load(io.BytesIO(kept), allow_pickle=False) as data:
             qpos, frames = data["qpos"].astype(np.float64), data["frames"]
         if suffix == "jpg":
-            write_atomic(file, self._renderer.submit(lambda renderer: filmstrip(renderer, qpos)).result())
+            strip = self._renderer.submit(lambda renderer: filmstrip(renderer, qpos)).result()
+            write_atomic(file, sealed(strip))
         else:
             demo = read_frames(self._demo)
             self._renderer.submit(

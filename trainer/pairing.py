@@ -14,7 +14,7 @@ import numpy as np
 
 from trainer.choice import choose
 from trainer.clips import compose_clip
-from trainer.files import write_atomic
+from trainer.files import jpeg_fault, read_whole, sealed, write_atomic
 from trainer.learner import Learner
 from trainer.pairs import NewPair, Pair
 from trainer.records import Rollouts
@@ -66,8 +66,9 @@ class Pairing:
         ready = self._store.waiting_pairs(self._run)
         oldest = learner.iteration - _OLD
         stale = [p.id for p in ready if p.iteration < oldest or not self.file(p.id).exists()]
-        if not self._begun:  # a process before this one was to draw them
+        if not self._begun:  # a process before this one was to draw them, or has drawn them
             stale += [p.id for p in self._store.waiting_pairs(self._run, "cut")]
+            stale += [p.id for p in ready if not read_whole(self.file(p.id), jpeg_fault)]
             self._begun = True
         self._store.set_pair_state(stale, "withdrawn")
         waiting = [p for state in ("ready", "cut") for p in self._store.waiting_pairs(self._run, state)]
@@ -96,7 +97,7 @@ class Pairing:
             left, right = self._store.pair_segments(pair.id)
             index, first = np.unique(frames_of(pair.demo_step + np.arange(pair.steps)), return_index=True)
             robots = [renderer.render(segment.qpos[first]) for segment in (left, right)]
-            write_atomic(self.file(pair.id), compose_clip(self._frames[index], *robots))
+            write_atomic(self.file(pair.id), sealed(compose_clip(self._frames[index], *robots)))
             self._store.set_pair_state([pair.id], "ready")
         except Exception:
             log.exception("pair %d could not be drawn", pair.id)
