@@ -18,7 +18,8 @@ _HEAD = """<title>onedemo</title>
 <meta name="color-scheme" content="light dark">
 <link rel="icon" href="/static/icon.svg" type="image/svg+xml">
 <link rel="stylesheet" href="/static/page.css">
-<script type="module" src="/static/page.js"></script>
+<script src="/static/player.js"></script>
+<script src="/static/page.js"></script>
 """
 
 
