@@ -42,7 +42,7 @@ def locked(file):
 
 @contextmanager
 def no_room(file):
-    """No file may grow beyond 64 KiB: a checkpoint is larger. The database is left alone by then."""
+    """No file may grow beyond 64 KiB: a checkpoint is larger, and so may the database be."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, hard))
     try:
@@ -91,7 +91,7 @@ def small_disk(tmp_path):
     ("fault", "words"),
     [
         (locked, "Another program holds the database"),
-        (no_room, "A file has grown"),
+        (no_room, "ulimit -f"),  # whether it is a file of ours or the database that may not grow
         (full, "The disk is full"),
         (no_right, "may not be written to"),
     ],

@@ -30,6 +30,8 @@ _SAID = {
     "SQLITE_BUSY": _LOCKED,
     "SQLITE_LOCKED": _LOCKED,
     "SQLITE_NOMEM": _CAUSES[errno.ENOMEM],
+    # SQLite tells a broken disk and a file that may not grow (ulimit -f) by the same number.
+    "SQLITE_IOERR": "The database cannot be written: check the disk, and the largest file (ulimit -f).",
 }
 
 
