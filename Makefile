@@ -16,15 +16,16 @@ run: .venv/.installed
 
 setup: .venv/.installed
 
-# The first side by side on two cores; those with servers and browsers want both cores for themselves.
-SIDE_BY_SIDE := -n 2 --dist loadgroup
+# Side by side on two cores. Those with servers and browsers stay together by file: they share them.
+TWO := -n 2
+TWO_BY_FILE := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: .venv/.installed-test
-	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not seam"
-	$(BIN)/python -m pytest -m seam
+	$(BIN)/python -m pytest $(TWO) -m "not seam"
+	$(BIN)/python -m pytest $(TWO_BY_FILE) -m seam
 
 test-fast: .venv/.installed-test
-	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not seam and not slow"
+	$(BIN)/python -m pytest $(TWO) -m "not seam and not slow"
 
 check: .venv/.installed-test
 	$(BIN)/ruff check .

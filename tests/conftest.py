@@ -17,16 +17,24 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Side by side, a file stays in one process, and so do the tests that share runs of tables."""
-    for item in items:
-        shared = "results" in getattr(item, "fixturenames", ())
-        item.add_marker(pytest.mark.xdist_group("results" if shared else item.path.stem))
+    """The tables come first: they take longest, and another process takes the rest meanwhile."""
+    items.sort(key=lambda item: "results" not in getattr(item, "fixturenames", ()))
 
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished runs of all tables, so that demo and robot are looked at once, and runs are shared."""
-    return tmp_path_factory.mktemp("results")
+    """Finished runs of all tables, so that demo and robot are looked at once, and runs are shared.
+
+    The robot is learned from fewer pictures than it is for people: a minute less.
+    """
+    from trainer import appearance
+    from trainer.encoders import make_encoder
+
+    directory = tmp_path_factory.mktemp("results")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(appearance, "PICTURES", 1000)
+        appearance.learn("hopper", make_encoder("efficientnet-lite0"), directory / "cache" / "robots")
+    return directory
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ STEPS = 1_500_000
 BASELINE_STEPS = 3_000_000
 """Of the two baselines without a demo."""
 RATINGS = 350
-QUICK_STEPS, QUICK_RATINGS = 64_000, 60
+QUICK_STEPS, QUICK_RATINGS = 32_000, 60
 
 _TUMBLE, _CLEAN = "hopper-backflip", "hopper-flip-clean"
 _HAND, _PREFERENCES = "TRPO, hand-coded reward", "preferences"

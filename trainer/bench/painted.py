@@ -19,6 +19,8 @@ CHROMIUM_FLAGS = [
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",  # what is no WebGL is painted faster without a GPU that is none
+    "--disable-gpu-rasterization",
     "--no-sandbox",
     "--disable-quic",
     "--no-first-run",
