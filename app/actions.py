@@ -33,7 +33,7 @@ class Actions:
             raise ValueError("an action has a name")
         actions = {
             "leave out": self._leave_out, "take in": self._take_in, "open run": self._open,
-            "new run": self._create,
+            "new run": self._create, "pause run": self._pause, "resume run": self._resume,
         }  # fmt: skip
         if body["do"] not in actions:
             raise ValueError(f"there is no action {body['do'][:40]!r}")
@@ -51,6 +51,14 @@ class Actions:
     def _open(self, who: Rater, fields: dict[str, Any]) -> None:
         _check(fields, {"run": str})
         self._study.open(fields["run"])
+
+    def _pause(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {})
+        self._page.trainer.pause()
+
+    def _resume(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {})
+        self._page.trainer.resume()
 
     def _create(self, who: Rater, fields: dict[str, Any]) -> None:
         _check(fields, {"demo": str, "method": str, "seed": int, "name": str, "predictor_from": str})
@@ -76,7 +84,7 @@ class Actions:
 
 def _check(fields: dict[str, Any], kinds: dict[str, type]) -> None:
     if set(fields) != set(kinds) or any(type(fields[name]) is not kind for name, kind in kinds.items()):
-        raise ValueError(f"the action takes {', '.join(kinds)}")
+        raise ValueError(f"the action takes {', '.join(kinds) or 'no fields'}")
     for name, value in fields.items():
         if isinstance(value, str) and not (len(value) <= _LONGEST and (value == "" or value.isprintable())):
             raise ValueError(f"{name} is up to {_LONGEST} printable characters")

@@ -9,6 +9,7 @@ import numpy as np
 
 from app.words import ANSWERS
 
+_TRUE_REWARD = "True reward (points; never trained on)"
 _POINTS = 1500
 """A curve longer than this is thinned: a screen has no more columns."""
 
@@ -29,13 +30,11 @@ class Charts:
         """All iterations so far."""
         blue, teal, amber = ("#8ab0ff", "#5fd0b8", "#f0b661") if dark else ("#2f5dc4", "#0d8a72", "#b26a00")
         self._curves = [
-            _Curve(gui, "predicted", "Predicted rating", blue, dark, (1.0, 5.0)),
+            _Curve(gui, "predicted", "Predicted rating (1 to 5)", blue, dark, (1.0, 5.0)),
             _Curve(gui, "kl", "KL per policy step (nats)", teal, dark, None),
         ]
         if has_reward:
-            self._curves.append(
-                _Curve(gui, "true_reward", "True reward (never trained on)", amber, dark, None)
-            )
+            self._curves.append(_Curve(gui, "true_reward", _TRUE_REWARD, amber, dark, None))
 
     def extend(self, rows: list[dict]) -> None:
         """Adds iterations to the curves."""
@@ -64,21 +63,15 @@ class Comparison:
             data=(np.array([0.0]), np.array([np.nan])),
             series=self._series([""]),
             legend={"show": True},
-            **_plot(title, dark, (1.0, 5.0) if self._limited else None),
+            **_plot(title, "control steps", dark, (1.0, 5.0) if self._limited else (0.0, 1.0)),
         )
 
     def draw(self, rows_of: Mapping[str, Sequence[dict]]) -> None:
         """Draws the curves of some runs, by name."""
         runs = list(rows_of) or [""]
         x, *curves = compared(rows_of, runs, self._key)
-        if not self._limited:  # uPlot finds no limits where a whole curve is missing
-            known = np.concatenate(curves)
-            known = known[np.isfinite(known)]
-            low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
-            margin = 0.05 * max(high - low, 1e-9)
-            self._handle.scales = {
-                "x": {"time": False}, "y": {"range": [float(low - margin), float(high + margin)]},
-            }  # fmt: skip
+        if not self._limited:
+            self._handle.scales = _scales(limits_of(np.concatenate(curves)))
         self._handle.series = self._series(runs)
         self._handle.data = (x, *curves)
 
@@ -96,16 +89,18 @@ class _Curve:
     def __init__(
         self, gui: Any, key: str, title: str, colour: str, dark: bool, limits: tuple[float, float] | None
     ) -> None:
-        self._key = key
+        self._key, self._limited = key, limits is not None
         self._handle = gui.add_uplot(
             data=(np.array([0.0]), np.array([np.nan])),
             series=({"label": "iteration"}, _line(title, colour, points=False)),
             legend={"show": False},
-            **_plot(title, dark, limits),
+            **_plot(title, "iteration", dark, limits or (0.0, 1.0)),
         )
 
     def draw(self, rows: list[dict]) -> None:
         x, y = curve_points(rows, self._key)
+        if not self._limited:
+            self._handle.scales = _scales(limits_of(y))
         self._handle.data = (x, y)
 
 
@@ -117,16 +112,26 @@ def _line(label: str, colour: str, *, points: bool) -> dict[str, Any]:
     return {"label": label, "stroke": colour, "width": 2, "points": {"show": points}, "spanGaps": True}
 
 
-def _plot(title: str, dark: bool, limits: tuple[float, float] | None) -> dict[str, Any]:
+def limits_of(values: np.ndarray) -> tuple[float, float]:
+    """Limits of an axis for values, (n,), nan where there is none: uPlot finds none if all are."""
+    known = values[np.isfinite(values)]
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
+    margin = 0.05 * max(high - low, 0.1 * abs(high), 1e-9)
+    return float(low - margin), float(high + margin)
+
+
+def _scales(limits: tuple[float, float]) -> dict[str, Any]:
+    return {"x": {"time": False}, "y": {"range": list(limits)}}
+
+
+def _plot(title: str, along: str, dark: bool, limits: tuple[float, float]) -> dict[str, Any]:
     """What all charts look like."""
     ink = "#9ba7b7" if dark else "#566173"
     grid = {"stroke": "rgba(255,255,255,.06)" if dark else "#e9ecf1", "width": 1}
     axis = {"stroke": ink, "grid": grid, "ticks": {"show": False}, "font": "11px system-ui, sans-serif"}
-    scales: dict[str, Any] = {"x": {"time": False}}
-    if limits:
-        scales["y"] = {"range": list(limits)}
+    below = axis | {"size": 26, "label": along, "labelSize": 16, "labelFont": "11px system-ui, sans-serif"}
     return {
-        "title": title, "scales": scales, "axes": (axis | {"size": 30}, axis | {"size": 46}),
+        "title": title, "scales": _scales(limits), "axes": (below, axis | {"size": 46}),
         "cursor": {"drag": {"x": True, "y": False}}, "height": 190, "padding": (10, 14, 0, 0),
     }  # fmt: skip
 

@@ -16,6 +16,7 @@ from app.bench import add_commands
 from app.cli_care import add_care_commands
 from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
 from app.cli_people import add_people_commands
+from trainer.demo_checks import read_crop
 from trainer.errors import UserError
 
 
@@ -356,10 +357,9 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
 
 def _crop(text: str) -> tuple[int, int, int, int]:
     try:
-        x, y, width, height = (int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be four whole numbers X,Y,W,H, got {text!r}") from None
-    return x, y, width, height
+        return read_crop(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _port(text: str) -> int:

@@ -119,10 +119,14 @@ def _summary(whole: Quality) -> str:
     elif alike.clips:
         interval = f"{alike.clips} clips, all rated the same"
     cells = (
-        ("Agreement between raters", alpha, f"Krippendorff’s alpha; {interval}"),
+        ("Agreement between raters", alpha, f"Krippendorff’s alpha, good from 0.67; {interval}"),
         ("Same on a second look", *_steady(whole)),
         ("Time per rating", _number(whole.seconds, "s"), "median"),
-        ("Drift", _number(whole.drift, "points", sign=True), "last third against first, beside predictions"),
+        (
+            "Drift",
+            _number(whole.drift, "points", sign=True),
+            "last third above the first, for like clips",
+        ),
     )
     return '<dl class="od-quality">' + "".join(
         f"<div><dt>{name}</dt><dd>{value}<small>{note}</small></dd></div>" for name, value, note in cells
@@ -149,8 +153,11 @@ def _raters_table(
     return (
         '<div class="od-scroll" tabindex="0" role="region" aria-label="Raters"><table><thead><tr>'
         f"{head}</tr></thead><tbody>{rows}</tbody></table></div>"
-        '<p class="od-quiet">Agreement is on the clips that others have rated too. A rater who is left out '
-        "stays in the data, marked, and nothing learns from the ratings until they are taken in again.</p>"
+        '<p class="od-quiet">Agreement is on the clips that others have rated too: 1 is perfect, 0 chance; '
+        "from 0.67 conclusions hold. Second look: the share rated the same again. Drift, in points: how much "
+        "higher the last third of the ratings is than the first, for clips that were predicted alike. "
+        "A rater who is left out stays in the data, marked, and nothing learns from the ratings until they "
+        "are taken in again.</p>"
     )
 
 

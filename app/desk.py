@@ -21,6 +21,11 @@ from trainer.store import Store
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
 
+
+class AnsweredElsewhere(Exception):
+    """What was pressed at a page is answered already, by the same person at another page."""
+
+
 Mark = tuple[float, float]
 """Where a clip goes wrong: its first picture, and the picture after the last; whole numbers."""
 
@@ -75,6 +80,10 @@ class Desk:
         """Where the clip on screen goes wrong, as far as said."""
         self.skipped: int | None = None
         """The clip that was skipped last, as long as its reason may still be said."""
+        self.explained = False
+        """Whether its reason was said, until the next press."""
+        self.taken_back: Ask | None = None
+        """What was answered to the clip on screen before it was taken back."""
 
     @property
     def current(self) -> int | None:
@@ -108,6 +117,7 @@ class Desk:
             False if the press counts for nothing.
 
         Raises:
+            AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
             sqlite3.Error: If it could not be committed; the clip stays.
         """
         with self._lock:
@@ -116,7 +126,7 @@ class Desk:
                 return False
             seconds = self._seconds(clip, self.mark) if self.mark is not None else None
             self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=seconds, repeat=ask.repeat)
-            self._leave(replace(ask, mark=self.mark))
+            self._leave(replace(ask, mark=self.mark, value=value))
             return True
 
     def skip(self, clip: int) -> bool:
@@ -141,7 +151,7 @@ class Desk:
             if clip != self.skipped:
                 return False
             self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._done[-1].repeat)
-            self.skipped = None
+            self.skipped, self.explained = None, True
             return True
 
     def set_mark(self, clip: int, mark: Mark | None) -> bool:
@@ -189,7 +199,8 @@ class Desk:
             if self._upcoming is not None and self._current is not None:
                 self._assignment.release(self._holder, self._upcoming.clip)
             self._upcoming = self._current or self._upcoming
-            self._show(replace(ask, mark=None))
+            self._show(Ask(ask.clip, ask.kind))
+            self.taken_back = ask
             self.mark = ask.mark  # it is seen again, and goes with the next rating unless it is cleared
             return True
 
@@ -201,10 +212,9 @@ class Desk:
         in_time = self._clock() - self._shown_at >= GUARD_SECONDS
         ask = self._current if clip == self.current and in_time else None
         if ask is not None and self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat):
-            # The same person has answered it at another page meanwhile.
             self._assignment.release(self._holder, ask.clip)
             self._advance()
-            return None
+            raise AnsweredElsewhere("You had rated that clip at another page of yours: that answer stands.")
         return ask
 
     def _latency_ms(self) -> int:
@@ -261,7 +271,8 @@ class Desk:
 
     def _show(self, ask: Ask | None) -> None:
         self._current = ask
-        self.mark = self.skipped = None
+        self.mark = self.skipped = self.taken_back = None
+        self.explained = False
         self._shown_at = self._clock()
         if ask is not None:
             self._assignment.hold(self._holder, ask.clip, now=self._shown_at)

@@ -165,6 +165,10 @@ class Front:
         except Exception as error:  # whatever it is: the caller must not believe the port open
             failure.append(error)
         finally:
+            # What is still being answered would ask for a thread after there are none.
+            for task in (left := asyncio.all_tasks(self._loop)):
+                task.cancel()
+            self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
             self._loop.run_until_complete(self._loop.shutdown_default_executor())
             self._loop.close()
             ready.set()

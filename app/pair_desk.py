@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Hashable
 
 from app.assignment import Assignment, Seat
-from app.desk import GUARD_SECONDS
+from app.desk import GUARD_SECONDS, AnsweredElsewhere
 from trainer.records import Rater
 from trainer.store import Store
 
@@ -61,12 +61,19 @@ class PairDesk:
             False if the press counts for nothing.
 
         Raises:
+            AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
             sqlite3.Error: If it could not be committed; the pair stays.
         """
         with self._lock:
             seconds = self._clock() - self._shown_at
             if pair != self.current or seconds < GUARD_SECONDS:
                 return False
+            if self._store.compared(pair, self._rater.id):
+                self._assignment.release(self._holder, pair)
+                self._advance()
+                raise AnsweredElsewhere(
+                    "You had compared that pair at another page of yours: that answer stands."
+                )
             self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
             self._done.append(pair)
             self._assignment.release(self._holder, pair)

@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from app.desk import AnsweredElsewhere
+
 log = logging.getLogger("onedemo.page")
 
 
@@ -23,7 +25,7 @@ class Pressing:
         self._lock = threading.RLock()
         self._shown = False
         self._problem = ""
-        """Why the last press could not be committed, one sentence; "" if it could."""
+        """Why the last press was not committed, one sentence; "" if it was."""
         self._content: dict[int, str] = {}
 
     def _draw(self) -> None:
@@ -38,6 +40,9 @@ class Pressing:
     def _attempt(self, action: Callable[[], bool], *, keep_problem: bool = False) -> bool:
         try:
             moved = action()
+        except AnsweredElsewhere as told:
+            self._problem = str(told)
+            return True
         except (sqlite3.Error, ValueError) as error:
             log.exception("a press could not be saved")
             self._problem = f"This could not be saved ({error}). Nothing is lost: please try again."

@@ -34,12 +34,13 @@ def timeline_html(rows: Sequence[dict], seconds: float) -> str:
             told += f"; {seconds * missing / len(parts):.1f} s not reached (dashed)"
     else:
         told = "no part was reached"
+    dashes = "<i data-none></i> not reached" if None in parts else ""
     return (
         '<section class="od-parts"><h3>Predicted rating along the video '
         f"<small>iteration {row['number']:,}; {told}</small></h3>"
         f'<div class="od-cells" role="img" aria-label="Predicted rating along the video: {told}">'
         f"{cells}</div>"
-        f'<p class="od-scale-note"><span>0 s</span><span class="od-legend">1 <i></i> 5</span>'
+        f'<p class="od-scale-note"><span>0 s</span><span class="od-legend">1 <i></i> 5{dashes}</span>'
         f"<span>{seconds:.1f} s</span></p></section>"
     )
 

@@ -45,7 +45,7 @@ class Rate(Pressing):
         self._drawn: tuple[int, str] | None = None
         self._mark: tuple[int, int] | None = None
         gui = session.client.gui
-        self._top = gui.add_html("")
+        self._notice, self._top = gui.add_html(""), gui.add_html("")
         self._stage = gui.add_html("")
         self._answering = gui.add_folder(None, visible=False)
         with self._answering:
@@ -55,7 +55,7 @@ class Rate(Pressing):
             self._slider = gui.add_slider("Rating", 1, 5, 1, _MIDDLE, marks=marks)
             gui.add_html(html.SUBMIT)
         self._tools = gui.add_html("")
-        self._why, self._ahead = gui.add_html(""), gui.add_html("")
+        self._ahead = gui.add_html("")
         gui.add_html(keys_dialog(RATE_KEYS))
 
     def show(self) -> None:
@@ -121,7 +121,7 @@ class Rate(Pressing):
         else:
             self._put(self._stage, html.waiting_html(self._status, count, self._problem))
         self._put(self._tools, html.tools_html(rating=asking, can_undo=self.desk.can_undo))
-        self._put(self._why, html.why_html(self.desk.skipped))
+        self._put(self._notice, html.notice_html(self.desk))
         self._put(self._ahead, html.ahead_html(self.desk.upcoming, self._version))
         self._show_answers(asking)
         self._set_keys(clip)
@@ -131,7 +131,7 @@ class Rate(Pressing):
         self._put(self._top, html.lesson_top_html(lesson.index + 1, len(lesson.exercises)))
         self._put(self._stage, html.lesson_html(lesson, self._pictures.demo, self._problem))
         self._put(self._tools, html.tools_html(rating=True, can_undo=False, practising=True))
-        self._put(self._why, "")
+        self._put(self._notice, "")
         self._show_answers(lesson.answer is None)
         key = ("lesson", lesson.index, lesson.answer)
         if key != self._keys_for:

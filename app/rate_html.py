@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from html import escape
 
+from app.desk import Desk
 from app.lesson import Lesson
 from app.player import example_address, player_html
 from app.words import ANSWERS, REASONS
 from trainer.records import Demo, Status
 
-SUBMIT = (
-    '<div class="od-submit">'
-    '<button type="button" class="od-button od-primary" data-submit>Submit</button></div>'
-)
+SUBMIT = '<div class="od-submit"><button type="button" class="od-button" data-submit>Submit</button></div>'
 _QUESTION = "How alike are the two movements?"
 
 
@@ -105,17 +103,28 @@ def _tool(label: str, key: str, attributes: str) -> str:
     return f'<button type="button" class="od-button" {attributes}>{label} <kbd>{key}</kbd></button>'
 
 
-def why_html(clip: int | None) -> str:
-    """After a skip: why, for those who like to say."""
-    if clip is None:
-        return ""
+def notice_html(desk: Desk) -> str:
+    """In the place of the question: what the last press did, where that is not plain; after a skip, why."""
+    if desk.skipped is not None:
+        return _why_html(desk.skipped)
+    told = ""
+    if desk.explained:
+        told = "Noted. Thank you."
+    elif desk.taken_back is not None:
+        value = desk.taken_back.value
+        before = "skipped it" if value is None else f"said <b>{value}: {ANSWERS[value - 1]}</b>"
+        told = f"Taken back: you had {before}. What do you say now?"
+    return f'<div class="od-why" role="status"><span>{told}</span></div>' if told else ""
+
+
+def _why_html(clip: int) -> str:
     reasons = "".join(
         f'<button type="button" class="od-chip" data-reason="{escape(reason)}">{escape(reason)}</button>'
         for reason in REASONS
     )
     return (
         f'<div class="od-why" data-clip="{clip}" role="group" aria-label="Why was it skipped?">'
-        f"<span>Skipped. Why, if you like to say?</span>{reasons}"
+        f"<span>Skipped. Why?</span>{reasons}"
         '<input type="text" maxlength="200" placeholder="Something else" aria-label="Another reason"></div>'
     )
 

@@ -11,7 +11,7 @@ from app import charts
 from app.uploads import form_html
 from trainer.config import METHODS
 from trainer.demos import list_demos
-from trainer.records import Status
+from trainer.records import HALTED, Status
 
 if TYPE_CHECKING:
     from app.session import Session
@@ -43,8 +43,8 @@ class Runs:
         self._curves = [
             charts.Comparison(gui, key, title, dark=session.dark)
             for key, title in (
-                ("predicted", "Predicted rating (1 to 5) by control steps"),
-                ("true_reward", "True reward of an episode by control steps (never trained on)"),
+                ("predicted", "Predicted rating (1 to 5)"),
+                ("true_reward", "True reward of an episode (points; never trained on)"),
             )
         ]
         demos = [demo.name for demo in list_demos(page.trainer.data_dir / "demos")]
@@ -160,12 +160,12 @@ def runs_html(
         what = f'data-do="open run" data-run="{escape(name)}"'
         action = f'<button type="button" class="od-button od-small" {what}>Open</button>'
         if here:
-            action = f"<b>{escape(status.phase)}</b>"
+            action = _here_html(status)
         cells = (
             escape(run["demo"]), escape(method_of(run["config"])), run["seed"], row["ratings"],
             f"{row['number']:,}" if "number" in row else "–",
             charts.short(row["env_steps"]) if "env_steps" in row else "–",
-            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), ""),
+            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), "points"),
             f'<button type="button" class="od-button od-small" data-compare="{escape(name)}" '
             f'aria-pressed="{str(name in drawn).lower()}" aria-label="Compare {escape(name)}">'
             f"{'✓' if name in drawn else '+'}</button>",
@@ -181,12 +181,19 @@ def runs_html(
     return (
         '<article class="od-data od-runs"><div class="od-data-top"><div><h1>Runs</h1>'
         "<p>One at a time is trained and rated. Opening another stops this one after its iteration; nothing "
-        "is lost.</p></div></div>"
+        "is lost. To branch off a run, make a new one whose predictor starts from that run’s.</p></div></div>"
         '<section><div class="od-scroll" tabindex="0" role="region" aria-label="Runs">'
         f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
         "<h2>Compare</h2><p class=od-quiet>Tick a run in the column Compare, or write a part of its name."
         "</p></article>"
     )
+
+
+def _here_html(status: Status) -> str:
+    """What the run at hand does, and the button that halts it or lets it go on."""
+    act, label = ("resume", "Resume") if status.phase in HALTED else ("pause", "Pause")
+    button = f'<button type="button" class="od-button od-small" data-do="{act} run">{label}</button>'
+    return f"<b>{escape(status.phase)}</b> {button if status.phase != 'done' else ''}"
 
 
 def new_run_html(demos: Sequence[str], runs: Sequence[str]) -> str:
@@ -195,14 +202,14 @@ def new_run_html(demos: Sequence[str], runs: Sequence[str]) -> str:
     def options(values: Sequence[str], first: str = "") -> str:
         return first + "".join(f"<option>{escape(value)}</option>" for value in values)
 
-    nothing = '<option value="">nothing</option>'
+    nothing = '<option value="">nothing: from scratch</option>'
     return (
         '<article class="od-data od-new-run"><section><h3>New run</h3>'
         '<form class="od-filter" data-act="new run">'
         f'<label>Demonstration <select name="demo">{options(demos)}</select></label>'
         f'<label>Method <select name="method">{options(list(METHODS))}</select></label>'
         '<label>Seed <input name="seed" type="number" min="0" max="999999" value="0" required></label>'
-        '<label>Name <input name="name" maxlength="64" placeholder="by itself"></label>'
+        '<label>Name <input name="name" maxlength="64" placeholder="given if left empty"></label>'
         '<label>Predictor starts from <select name="predictor_from">'
         f"{options(runs, nothing)}</select></label>"
         '<button class="od-button od-primary">Start</button></form>'
@@ -223,4 +230,4 @@ def method_of(config: str) -> str:
 def _figure(value: float | None, unit: str) -> str:
     if value is None:
         return "–"
-    return f"{value:,.1f} <small>{unit}</small>" if unit else f"{value:,.0f}"
+    return f"{value:,.{0 if unit == 'points' else 1}f} <small>{unit}</small>"

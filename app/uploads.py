@@ -17,6 +17,7 @@ from typing import Any
 
 from aiohttp import BodyPartReader, web
 
+from trainer.demo_checks import read_crop
 from trainer.demos import import_video
 from trainer.errors import UserError
 
@@ -27,7 +28,7 @@ LONGEST_SECONDS = 600.0
 MOST_AT_ONCE = 2
 """Uploads, with their decoding."""
 _LONGEST_FIELD = 200
-_FIELDS = ("name", "start", "end", "mirror")
+_FIELDS = ("name", "start", "end", "crop", "mirror")
 
 
 class Uploads:
@@ -47,7 +48,7 @@ class Uploads:
             left.unlink(missing_ok=True)
 
     async def add(self, request: web.Request) -> web.Response:
-        """Answers a form with ``name``, if wanted ``start``, ``end``, ``mirror``, and last of all ``video``.
+        """Answers a form with ``name``, if wanted ``start``, ``end``, ``crop``, ``mirror``, last ``video``.
 
         The answer is one sentence: what the demo is now, or what was wrong.
         """
@@ -120,7 +121,11 @@ def _options(fields: dict[str, str]) -> dict[str, Any]:
             times[name] = math.nan
         if times[name] is not None and not math.isfinite(times[name]):
             raise ValueError(f"{name} is a number of seconds")
-    return {"name": fields.get("name", ""), "mirror": fields.get("mirror") == "on", **times}
+    try:
+        crop = read_crop(fields["crop"]) if fields.get("crop") else None
+    except ValueError as error:
+        raise ValueError(f"the part of the video {error}") from None
+    return {"name": fields.get("name", ""), "crop": crop, "mirror": fields.get("mirror") == "on", **times}
 
 
 def form_html() -> str:
@@ -133,6 +138,8 @@ def form_html() -> str:
         '<label>From second <input name="start" inputmode="decimal" maxlength="10" placeholder="its start">'
         "</label>"
         '<label>To second <input name="end" inputmode="decimal" maxlength="10" placeholder="its end"></label>'
+        '<label>Only this part, pixels <input name="crop" maxlength="40" '
+        'placeholder="x, y, width, height"></label>'
         '<label>Faces left <select name="mirror"><option value="">no</option>'
         '<option value="on">yes: mirror it</option></select></label>'
         '<label class="od-file">Video <input name="video" type="file" accept="video/*,.gif" required></label>'

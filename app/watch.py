@@ -16,7 +16,7 @@ from app import charts, progress
 from app.live import Moment
 from app.pictures import version_of
 from app.words import nobody_html
-from trainer.records import Status
+from trainer.records import HALTED, Status
 
 if TYPE_CHECKING:
     from app.session import Session
@@ -127,7 +127,7 @@ class Watch:
         self._commands.append(command)
 
     def _toggle(self) -> None:
-        if self._trainer.status().phase in ("paused", "failed", "stopped"):
+        if self._trainer.status().phase in HALTED:
             self._trainer.resume()
             self._log("resumed the run")
         else:
@@ -206,7 +206,7 @@ def strip_html(status: Status, confirming: bool) -> str:
         ("Iteration", f"{status.iteration:,}", ""),
         ("Steps", f"{charts.short(status.env_steps)}", f"of {charts.short(status.total_steps)}"),
         ("Speed", f"{status.steps_per_s:,.0f}", "steps/s"),
-        ("Predictor", f"{status.snapshot}" if status.snapshot else "–", "snapshot"),
+        ("Predictor", f"No. {status.snapshot}" if status.snapshot else "–", ""),
         ("Ratings", f"{status.ratings}", f"of {status.target_ratings}"),
     ]
     cells = "".join(f"<div><dt>{n}</dt><dd>{v} <small>{u}</small></dd></div>" for n, v, u in figures)
@@ -247,7 +247,7 @@ def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> 
         note: One sentence below it.
     """
     share = min(1.0, demo_seconds / length) if length else 0.0
-    taken = f", after {seconds:.1f} s" if abs(seconds - demo_seconds) >= _APART_SECONDS else ""
+    taken = f", {seconds:.1f} s into the attempt" if abs(seconds - demo_seconds) >= _APART_SECONDS else ""
     return (
         f'<div class="od-time"><i><i style="width:{100 * share:.1f}%"></i></i>'
         f"<span>Video at {demo_seconds:.1f} s of {length:.1f} s{taken}</span><em>{note}</em></div>"

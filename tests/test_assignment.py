@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from app.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
-from app.desk import Desk
+from app.desk import AnsweredElsewhere, Desk
 from trainer.answers import Answered
+from trainer.asking import Asking
+from trainer.config import RatingsConfig, RunConfig
 from trainer.records import Segment
 from trainer.store import NewClip, Store
 
@@ -210,8 +212,10 @@ def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clo
     clock.now += 1
     desk.skip(1)
     assert not desk.explain(2, "dark") and desk.explain(1, "dark") and not desk.explain(1, "again")
+    assert desk.explained
     clock.now += 1
     desk.skip(2)
+    assert not desk.explained
     clock.now += 1
     desk.rate(3, 3)
     assert not desk.explain(2, "too late")
@@ -288,6 +292,40 @@ def test_shares_of_what_is_asked_again_are_as_set():
     assert kinds.count("repeated") / kinds.count("fresh") == pytest.approx(0.05, abs=0.01)
 
 
+def test_as_many_clips_come_to_several_people_and_twice_to_one_as_are_meant_to(store, clock):
+    store.rows("PRAGMA synchronous = OFF")
+    add_clips(store, 400)
+    assignment = Assignment()
+    desks = [
+        make_desk(store, clock, name, assignment, rng=random.Random(seed))
+        for seed, name in enumerate(("bo", "cy", "di"))
+    ]
+    while store.waiting_clips("r"):
+        for desk in desks:
+            desk.refill()
+            clock.now += 1
+            if desk.current is not None:
+                assert desk.rate(desk.current, 3)
+    rows = [(row[1], row[4], row[14]) for row in store.iter_ratings()]
+    firsts = [(clip, rater) for clip, rater, repeat in rows if not repeat]
+    repeats = [(clip, rater) for clip, rater, repeat in rows if repeat]
+    assert len({clip for clip, _ in firsts}) == 400 and len(set(firsts)) == len(firsts)
+    assert (len(firsts) - 400) / 400 == pytest.approx(0.10, abs=0.045)
+    assert len(repeats) / 400 == pytest.approx(0.04, abs=0.03)
+    assert set(repeats) <= set(firsts) and len(set(repeats)) == len(repeats)
+
+
+def test_clips_that_nobody_rated_in_time_are_taken_back(store):
+    ids = add_clips(store, 3)  # all of iteration 1
+    store.rate(ids[0], store.ensure_rater("bo", "annotator").id, 4, 900)
+    config = RunConfig(ratings=RatingsConfig(stale_iterations=10))
+    asking = Asking(store, "r", config, None)
+    asking.withdraw_stale(11)
+    assert [clip.id for clip in store.waiting_clips("r")] == ids[1:]
+    asking.withdraw_stale(12)
+    assert store.waiting_clips("r") == [] and [row[1] for row in store.iter_ratings()] == ids[:1]
+
+
 def test_while_nothing_fresh_waits_nothing_is_asked_again(store, clock):
     assignment = Assignment()
     add_clips(store, 1)
@@ -314,7 +352,9 @@ def test_a_clip_that_was_rated_at_another_page_of_the_same_person_is_let_go(stor
     assert second.current == first.current == 1
     clock.now += 1
     assert second.rate(1, 4)
-    assert not first.rate(1, 2) and first.current != 1
+    with pytest.raises(AnsweredElsewhere, match="at another page of yours"):
+        first.rate(1, 2)
+    assert first.current != 1
     clock.now += 1
     assert first.rate(first.current, 3)
     assert [row[5] for row in store.iter_ratings()] == [4, 3]

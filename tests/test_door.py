@@ -450,8 +450,15 @@ def test_what_researchers_do_is_in_the_log(site):
         jar = aiohttp.CookieJar(unsafe=True)
         async with aiohttp.ClientSession(cookie_jar=jar, headers={"Origin": site.url}) as session:
             await (await session.get(site.links["researcher"])).read()
-            for path in ("/export.csv?run=backflip-1", "/segments.parquet", "/card.md", "/comparisons.csv"):
-                await (await session.get(site.url + path)).read()
+            exports = (
+                "export.csv?run=backflip-1",
+                "segments.parquet",
+                "card.md",
+                "comparisons.csv",
+                "skips.csv",
+            )
+            for path in exports:
+                await (await session.get(f"{site.url}/{path}")).read()
             await session.post(f"{site.url}/r/1/do", json={"do": "leave out", "rater": 2})
             await session.post(f"{site.url}/r/1/do", json={"do": "leave out", "rater": 99})
         async with browser_session() as session:
@@ -465,10 +472,10 @@ def test_what_researchers_do_is_in_the_log(site):
     lines = [(who, what, detail) for _, who, what, detail in site.trainer.store.audit()]
     assert [line[1] for line in lines] == [
         "came in", "took out ratings", "took out segments", "took out the data card", "took out comparisons",
-        "leave out", "came in", "paused the run",
+        "took out skips", "leave out", "came in", "paused the run",
     ]  # fmt: skip
     assert {line[0] for line in lines} == {"ada"}
-    assert lines[1][2] == "run=backflip-1" and lines[5][2] == "rater 2; run backflip-1"
+    assert lines[1][2] == "run=backflip-1" and lines[6][2] == "rater 2; run backflip-1"
 
 
 # What is read

@@ -12,6 +12,7 @@ from worlds import falling_demo, falling_states, small_config
 from app.assignment import Assignment
 from app.cli import main
 from app.columns import COMPARISONS
+from app.desk import AnsweredElsewhere
 from app.pair_desk import PairDesk
 from trainer.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from trainer.demos import read_frames
@@ -125,6 +126,24 @@ def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_aga
     assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
 
 
+def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(store, pairs):
+    clock, assignment = Clock(), Assignment()
+    bo = store.ensure_rater("bo", "annotator")
+    laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock) for page in ("laptop", "phone"))
+    laptop.refill()
+    clock.now += 121  # the lease has ended
+    phone.refill()
+    clock.now += 1
+    assert phone.current == laptop.current == pairs[0] and phone.answer(pairs[0], "left")
+    with pytest.raises(AnsweredElsewhere, match="at another page of yours"):
+        laptop.answer(pairs[0], "right")
+    moved_to = laptop.current
+    assert moved_to not in (None, pairs[0]) and not laptop.can_undo
+    clock.now += 1
+    assert laptop.answer(moved_to, "equal")
+    assert [(row[1], row[5]) for row in store.iter_comparisons()] == [(pairs[0], "left"), (moved_to, "equal")]
+
+
 def test_pairs_are_beside_one_moment_of_the_demo_and_no_clip_is_in_two():
     clock = np.tile(np.arange(200), (16, 1)) + 10 * np.arange(16)[:, None]
     whole = rollouts(clock)
@@ -164,6 +183,25 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         assert np.abs(robots[0] - robots[1]).max() > 60
         pairing.fill(learner, learner.random_rollouts())
         assert len(store.waiting_pairs("r")) == 6  # the queue is full
+
+        # A process that died: one pair answered, one without its picture, one with a damaged one, one that
+        # was still to be drawn.
+        answered, lost, damaged, *rest = (pair.id for pair in ready)
+        content = bytearray(pairing.file(damaged).read_bytes())
+        content[len(content) // 2] ^= 1
+        pairing.file(damaged).write_bytes(content)
+        store.compare(answered, store.ensure_rater("Ann", "annotator").id, "left", 900)
+        pairing.file(lost).unlink()
+        new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
+        undrawn = store.add_pairs("r", [new])[0].id
+        after = Pairing(store, "r", tmp_path / "pairs", read_frames(demo), drawing, seed=0)
+        after.want()
+        after.fill(learner, learner.random_rollouts())
+        drawing.submit(lambda renderer: None).result()
+        waiting = [pair.id for pair in store.waiting_pairs("r")]
+        assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
+        assert all(pairing.file(pair).exists() for pair in waiting)
+        assert store.waiting_pairs("r", "cut") == [] and store.count_comparisons("r") == 1
 
 
 def test_a_policy_learns_from_what_people_compared(store):

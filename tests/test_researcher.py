@@ -174,6 +174,9 @@ def test_runs_side_by_side(chromium, site, viewport):
         assert page.locator(".od-current th").inner_text() == site.trainer.run
         until(lambda: page.locator(".uplot").count() == 2)
         assert page.locator('[data-compare][aria-pressed="true"]').count() == 2
+        for label in ("Pause", "Resume"):
+            page.click(f'.od-current >> text="{label}"')
+        until(lambda: [call for call in site.trainer.calls if call != "pairs"] == ["pause", "resume"])
         page.fill('.od-new-run [name="name"]', "another")
         page.click(".od-new-run button")
         page.wait_for_selector(".od-form-note >> text=there is this run alone")

@@ -14,7 +14,7 @@ from app.door import Door, Route
 from app.links import issue_link, read_secret
 from app.listening import Listening
 from app.uploads import Uploads
-from trainer.demos import find_demo
+from trainer.demos import find_demo, read_frames
 from trainer.store import Store
 
 pytestmark = pytest.mark.seam
@@ -79,10 +79,11 @@ def left(store):
 
 
 def test_a_video_becomes_a_demo(store, video):
-    status, said = send(store, video, start="0.2", end="0.8", mirror="on")
+    status, said = send(store, video, start="0.2", end="0.8", crop="8, 4, 48, 40", mirror="on")
     assert (status, said) == (200, "kick is a demo now: 0.6 s, 18 frames.")
     demo = find_demo("kick", store.path.parent / "demos")
     assert (demo.frames, demo.source) == (18, "uploaded")
+    assert read_frames(demo).shape[1:] == (40, 48, 3)
     assert left(store) == [demo.sha256]  # nothing named by the client, nothing temporary
 
 
@@ -110,6 +111,8 @@ def test_only_from_the_page(store, video):
         (None, {"name": "x" * 5000}, "Name is up to 200"),
         (None, {"start": "9"}, "Start 9 is past the end of the video"),
         (None, {"start": "nan"}, "Start is a number"),
+        (None, {"crop": "1,2,3"}, "The part of the video must be four whole numbers"),
+        (None, {"crop": "0,0,9999,9999"}, "[Cc]rop"),
         (None, {"owner": "me"}, "has the fields"),
     ],
 )

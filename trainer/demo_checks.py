@@ -120,3 +120,16 @@ def check_length(path: Path, seconds: float, *, start: float, end: float | None)
 
 def _too_long(path: Path) -> UserError:
     return UserError(f"{path} is longer than {MAX_SECONDS:g} s; choose a part of it with --start and --end")
+
+
+def read_crop(text: str) -> tuple[int, int, int, int]:
+    """What somebody has typed as the part of a video to use: x, y, width, height in pixels.
+
+    Raises:
+        ValueError: If it is not four whole numbers.
+    """
+    try:
+        x, y, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"must be four whole numbers X,Y,W,H, got {text!r}") from None
+    return x, y, width, height

@@ -132,6 +132,14 @@ class Pairs(Database):
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
+    def compared(self, pair_id: int, rater_id: int) -> bool:
+        """Whether an answer or skip of a rater stands on a pair."""
+        rows = self.rows(
+            "SELECT answer FROM comparisons WHERE pair_id = ? AND rater_id = ? ORDER BY id DESC LIMIT 1",
+            (pair_id, rater_id),
+        )
+        return bool(rows) and rows[0][0] != "undo"
+
     def count_comparisons(self, run: str) -> int:
         """How many answers hold in a run."""
         return self.rows("SELECT COUNT(*) FROM answers WHERE run = ?", (run,))[0][0]

@@ -145,6 +145,10 @@ class Rater:
     """One of ``ROLES``."""
 
 
+HALTED = ("paused", "failed", "stopped")
+"""Phases from which a run may be told to go on."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Status:
     """What the trainer is doing, as of now; the page shows it."""
