@@ -8,23 +8,29 @@ const clips = (() => {
   const WIDTH = { false: 972, true: 1464 }; // of a moment: video and one robot, or two
   const HOLD_S = 0.5; // the last frame stays so long before the clip starts over
   const SLOW = 0.25;
-  const KEPT = 8; // pictures kept in memory
+  const KEPT = 8; // pictures kept in memory, decoded: up to 17 MB each
 
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const pictures = new Map();
   const players = new Map();
   let slow = false;
 
+  // A bitmap stays decoded; an element's picture may have to be decoded again when it is drawn.
+  async function decoded(source) {
+    const answer = await fetch(source);
+    if (!answer.ok) throw new Error(`${source}: ${answer.status}`);
+    return createImageBitmap(await answer.blob());
+  }
+
   function picture(source) {
     let entry = pictures.get(source);
     if (entry) return entry;
-    const image = new Image();
-    entry = { image, ready: false };
+    entry = { image: null, ready: false };
     pictures.set(source, entry);
     if (pictures.size > KEPT) pictures.delete(pictures.keys().next().value);
-    image.src = source;
-    image.decode().then(
-      () => {
+    decoded(source).then(
+      (image) => {
+        entry.image = image;
         entry.ready = true;
         for (const player of players.values()) if (player.source === source) player.draw();
         wake();
@@ -65,10 +71,10 @@ const clips = (() => {
       return this.entry.ready;
     }
     get columns() {
-      return Math.round(this.entry.image.naturalWidth / this.width);
+      return Math.round(this.entry.image.width / this.width);
     }
     get frames() {
-      return this.ready ? this.columns * Math.round(this.entry.image.naturalHeight / HEIGHT) : 1;
+      return this.ready ? this.columns * Math.round(this.entry.image.height / HEIGHT) : 1;
     }
     get frame() {
       return Math.min(this.frames - 1, Math.floor(this.time * this.fps + 1e-6));

@@ -92,8 +92,9 @@ class Site:
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
+    monkeypatch.setattr("app.live.FRAMES_PER_SECOND", 5.0)  # without a GPU each costs a tenth of a second
     from standin import StandIn
 
     from app.assignment import Again
