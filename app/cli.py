@@ -16,7 +16,6 @@ from app.bench import add_commands
 from app.cli_care import add_care_commands
 from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
 from app.cli_people import add_people_commands
-from trainer.demo_checks import read_crop
 from trainer.errors import UserError
 
 
@@ -356,6 +355,8 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
 
 
 def _crop(text: str) -> tuple[int, int, int, int]:
+    from trainer.demo_checks import read_crop
+
     try:
         return read_crop(text)
     except ValueError as error:
