@@ -181,6 +181,13 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
         robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
         assert np.abs(robots[0] - robots[1]).max() > 60
+        left, _ = store.pair_segments(ready[0].id)
+        _, first = np.unique(
+            learner.frames_of(ready[0].demo_step + np.arange(ready[0].steps)), return_index=True
+        )
+        drawn = drawing.submit(lambda renderer: renderer.render(left.qpos[first])).result()[0]
+        apart = [np.abs(robot[..., ::-1] - drawn.astype(int)).mean() for robot in robots]
+        assert apart[0] < 2 < apart[1]  # the left one is on the left
         pairing.fill(learner, learner.random_rollouts())
         assert len(store.waiting_pairs("r")) == 6  # the queue is full
 
