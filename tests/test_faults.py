@@ -193,6 +193,8 @@ def test_errors_are_told_in_plain_words():
     assert in_words(UserError("wrong")) == "wrong"
     assert in_words(OSError(errno.ENOSPC, "No space")).startswith("The disk is full")
     assert in_words(MemoryError()) == "There is not enough memory: end other programs. (MemoryError)"
+    said = in_words(RuntimeError("OpenCV: (-4:Insufficient memory) Failed to allocate 10497600 bytes"))
+    assert said.startswith("There is not enough memory: end other programs. (RuntimeError: OpenCV")
     assert in_words(FloatingPointError("exploded")) == "FloatingPointError: exploded"
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as db:
         db.execute("PRAGMA max_page_count = 1")

@@ -23,6 +23,8 @@ _CAUSES = {
     errno.ENOMEM: "There is not enough memory: end other programs.",
     errno.EMFILE: "Too many files are open: raise the limit (ulimit -n).",
 }
+_NO_MEMORY = ("can't allocate memory", "Insufficient memory")
+"""As torch and OpenCV say it."""
 _LOCKED = "Another program holds the database: end it or wait for it."
 _SAID = {
     "SQLITE_FULL": _CAUSES[errno.ENOSPC],
@@ -42,7 +44,7 @@ def in_words(error: BaseException) -> str:
     words = ""
     if isinstance(error, OSError):
         words = _CAUSES.get(error.errno or 0, "")
-    elif isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+    elif isinstance(error, MemoryError) or any(said in str(error) for said in _NO_MEMORY):
         words = _CAUSES[errno.ENOMEM]
     elif isinstance(error, sqlite3.Error):
         name = getattr(error, "sqlite_errorname", "") or ""
