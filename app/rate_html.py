@@ -114,7 +114,7 @@ def notice_html(desk: Desk) -> str:
         value = desk.taken_back.value
         before = "skipped it" if value is None else f"said <b>{value}: {ANSWERS[value - 1]}</b>"
         told = f"Taken back: you had {before}. What do you say now?"
-    return f'<div class="od-why" role="status"><span>{told}</span></div>' if told else ""
+    return f'<div class="od-notice" role="status"><span>{told}</span></div>' if told else ""
 
 
 def _why_html(clip: int) -> str:
@@ -123,7 +123,7 @@ def _why_html(clip: int) -> str:
         for reason in REASONS
     )
     return (
-        f'<div class="od-why" data-clip="{clip}" role="group" aria-label="Why was it skipped?">'
+        f'<div class="od-notice" data-clip="{clip}" role="group" aria-label="Why was it skipped?">'
         f"<span>Skipped. Why?</span>{reasons}"
         '<input type="text" maxlength="200" placeholder="Something else" aria-label="Another reason"></div>'
     )

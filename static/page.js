@@ -175,7 +175,7 @@
         button.textContent = error.message;
       });
     } else if (data.compare) compare(data.compare);
-    else if ("reason" in data) sayWhy(button.closest(".od-why"), data.reason);
+    else if ("reason" in data) sayWhy(button.closest(".od-notice"), data.reason);
     else if ("submit" in data) {
       // What is on screen is what is rated: slider messages are throttled and may come too late.
       const thumb = shown(".mantine-Slider-thumb");
@@ -195,7 +195,7 @@
 
   // A reason of one's own, by Enter.
   document.addEventListener("keydown", (event) => {
-    const box = event.target instanceof Element ? event.target.closest(".od-why") : null;
+    const box = event.target instanceof Element ? event.target.closest(".od-notice") : null;
     if (box && event.key === "Enter" && event.target.value?.trim()) sayWhy(box, event.target.value.trim());
   });
 

@@ -61,7 +61,7 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
             assert_nothing_serious(page, tab)
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("s"))
-        page.wait_for_selector(".od-why")
+        page.wait_for_selector(".od-notice")
         assert_nothing_serious(page, "a skip")
         page.keyboard.press("?")
         page.wait_for_selector(".od-help[open]")

@@ -202,23 +202,23 @@ def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site, viewport
         shown_clip(page)
         place = page.locator(".od-clip").bounding_box()
         press_and_wait(page, site, lambda: page.keyboard.press("s"))
-        asked = page.locator(".od-why").bounding_box()  # where nobody has to look for it, and nothing moves
+        asked = page.locator(".od-notice").bounding_box()  # in plain sight, and nothing moves
         assert page.locator(".od-clip").bounding_box() == place
         assert asked["y"] >= 0 and asked["y"] + asked["height"] <= place["y"]
-        page.click(".od-why >> text=It is too short to tell")
-        page.wait_for_selector(".od-why >> text=Noted. Thank you.")
+        page.click(".od-notice >> text=It is too short to tell")
+        page.wait_for_selector(".od-notice >> text=Noted. Thank you.")
         page.wait_for_timeout(1200)  # the page is drawn anew twice a second
-        assert page.locator(".od-why").inner_text() == "Noted. Thank you."
+        assert page.locator(".od-notice").inner_text() == "Noted. Thank you."
         shown_clip(page)
         press_and_wait(page, site, lambda: page.click('.od-tools [data-key="s"]'))
         shown_clip(page)
         before = len(site.events())
-        page.click(".od-why input")
+        page.click(".od-notice input")
         page.keyboard.type("12345 s u m f ? <b>")
         page.wait_for_timeout(GUARD_MS)
         assert len(site.events()) == before and not page.locator(".od-help").is_visible()
         page.keyboard.press("Enter")
-        page.wait_for_selector(".od-why >> text=Noted. Thank you.")
+        page.wait_for_selector(".od-notice >> text=Noted. Thank you.")
         assert reasons() == [("It is too short to tell",), ("12345 s u m f ? <b>",)]
 
 
