@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from trainer.records import Rater
-from trainer.store import Store
+from onedemo.records import Rater
+from onedemo.store import Store
 
 
 class Actions:

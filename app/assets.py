@@ -6,7 +6,9 @@ from pathlib import Path
 
 import viser
 
-STATIC = Path(__file__).resolve().parent.parent / "static"
+from onedemo import static
+
+STATIC = Path(static.__file__).parent
 SERVED = {".css", ".js", ".svg", ".png", ".webp"}
 """Kinds of files that may leave the static folder."""
 PUBLIC = {"/static/login.css", "/static/icon.svg"}

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from trainer.bench.tables import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
-from trainer.errors import UserError
-from trainer.files import check_writable, write_atomic
+from onedemo.bench.tables import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
+from onedemo.errors import UserError
+from onedemo.files import check_writable, write_atomic
 
 
 def add_commands(actions: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -57,7 +57,7 @@ def _outputs(parser: argparse.ArgumentParser, *, quick: str) -> None:
 
 
 def _speed(arguments: argparse.Namespace) -> int:
-    from trainer.bench import report, speed
+    from onedemo.bench import report, speed
 
     unknown = set(arguments.parts or ()) - set(speed.PARTS)
     if unknown:
@@ -74,8 +74,8 @@ def _speed(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace) -> int:
-    from trainer.bench import document, study
-    from trainer.bench.account import complete
+    from onedemo.bench import document, study
+    from onedemo.bench.account import complete
 
     _check_outputs(arguments)
     _check_directory("--results", arguments.results)

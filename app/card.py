@@ -5,11 +5,11 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
-from app.quality import Quality, quality, quality_by_rater, rating_rows
-from app.words import ANSWERS
-from trainer.runs import program_version
-from trainer.store import Store
+from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
+from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
+from onedemo.app.words import ANSWERS
+from onedemo.runs import program_version
+from onedemo.store import Store
 
 
 def card(store: Store, run: str | None = None, *, now: datetime | None = None) -> str:

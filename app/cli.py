@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from app.bench import add_commands
-from app.cli_care import add_care_commands
-from app.cli_data import add_data_commands, add_data_dir, check_output, open_store
-from app.cli_people import add_people_commands
-from trainer.errors import UserError
+from onedemo.app.bench import add_commands
+from onedemo.app.cli_care import add_care_commands
+from onedemo.app.cli_data import add_data_commands, add_data_dir, check_output, open_store
+from onedemo.app.cli_people import add_people_commands
+from onedemo.errors import UserError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -194,7 +194,7 @@ _SETTINGS = ("method", "seed", "device", "encoder")
 
 
 def _config(arguments: argparse.Namespace) -> Any:
-    from trainer.config import load_config, parse_override, split_ratings
+    from onedemo.config import load_config, parse_override, split_ratings
 
     overrides = dict(parse_override(text) for text in arguments.settings)
     for key in _SETTINGS:
@@ -211,10 +211,10 @@ def _config(arguments: argparse.Namespace) -> Any:
 
 
 def _serve(arguments: argparse.Namespace) -> None:
-    from app.assignment import Again
-    from app.listening import Listening
-    from app.serve import serve
-    from trainer.demos import find_demo
+    from onedemo.app.assignment import Again
+    from onedemo.app.listening import Listening
+    from onedemo.app.serve import serve
+    from onedemo.demos import find_demo
 
     listening = Listening(
         host=arguments.host, port=arguments.port, tls_cert=arguments.tls_cert, tls_key=arguments.tls_key,
@@ -241,12 +241,12 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    from trainer.demos import find_demo
-    from trainer.encoders import make_encoder
-    from trainer.files import write_atomic
-    from trainer.headless import train
-    from trainer.store import Store
-    from trainer.transfer import newest_snapshot
+    from onedemo.demos import find_demo
+    from onedemo.encoders import make_encoder
+    from onedemo.files import write_atomic
+    from onedemo.headless import train
+    from onedemo.store import Store
+    from onedemo.transfer import newest_snapshot
 
     config = _config(arguments)
     if arguments.json is not None:
@@ -279,7 +279,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _demo_add(arguments: argparse.Namespace) -> None:
-    from trainer.demos import import_video
+    from onedemo.demos import import_video
 
     demo = import_video(
         arguments.video,
@@ -298,14 +298,14 @@ def _demo_add(arguments: argparse.Namespace) -> None:
 
 
 def _demo_list(arguments: argparse.Namespace) -> None:
-    from trainer.demos import list_demos
+    from onedemo.demos import list_demos
 
     for demo in list_demos(arguments.data_dir / "demos"):
         print(f"{demo.name:24} {demo.seconds:5.1f} s  {demo.width}x{demo.height}  {demo.source}")
 
 
 def _demo_show(arguments: argparse.Namespace) -> None:
-    from trainer.demos import find_demo, show
+    from onedemo.demos import find_demo, show
 
     print(show(find_demo(arguments.name, arguments.data_dir / "demos")))
 
@@ -313,7 +313,7 @@ def _demo_show(arguments: argparse.Namespace) -> None:
 def _baseline_trpo(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
-    from trainer.baselines.handcoded import HandcodedConfig, save_result, train_handcoded
+    from onedemo.baselines.handcoded import HandcodedConfig, save_result, train_handcoded
 
     lanes = max(1, arguments.lanes)
     config = HandcodedConfig(
@@ -334,7 +334,7 @@ def _baseline_trpo(arguments: argparse.Namespace) -> None:
 def _baseline_preferences(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
-    from trainer.baselines.preferences import (
+    from onedemo.baselines.preferences import (
         PreferencesConfig,
         save_preferences,
         split_comparisons,
@@ -355,7 +355,7 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
 
 
 def _crop(text: str) -> tuple[int, int, int, int]:
-    from trainer.demo_checks import read_crop
+    from onedemo.demo_checks import read_crop
 
     try:
         return read_crop(text)

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from app.cli_data import add_data_dir, check_output
-from trainer.errors import UserError
+from onedemo.app.cli_data import add_data_dir, check_output
+from onedemo.errors import UserError
 
 
 def add_care_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds them to the command line. Arguments as ``app.cli_data.add_data_commands``."""
+    """Adds them to the command line. Arguments as ``onedemo.app.cli_data.add_data_commands``."""
     save = command(commands, "backup", _backup, "everything in one file, also while the server runs")
     save.add_argument("file", type=Path, metavar="FILE", help="the archive, such as study.zip")
     save.add_argument("--force", action="store_true", help="replace FILE if it is there")
@@ -24,7 +24,7 @@ def add_care_commands(commands: Any, command: Callable[..., argparse.ArgumentPar
 
 
 def _backup(arguments: argparse.Namespace) -> None:
-    from trainer.backup import back_up
+    from onedemo.backup import back_up
 
     file: Path = arguments.file
     check_output(file, arguments.data_dir)
@@ -39,14 +39,14 @@ def _backup(arguments: argparse.Namespace) -> None:
 
 
 def _restore(arguments: argparse.Namespace) -> None:
-    from trainer.backup import restore
+    from onedemo.backup import restore
 
     there = restore(arguments.file, arguments.data_dir)
     print(f"{arguments.data_dir}: {there['files']:,} files, {there['ratings']:,} ratings, links as they were")
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from trainer.doctor import examine
+    from onedemo.doctor import examine
 
     wrong = 0
     for finding in examine(arguments.data_dir):

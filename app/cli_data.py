@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from trainer.errors import UserError
-from trainer.files import check_writable
+from onedemo.errors import UserError
+from onedemo.files import check_writable
 
 
 def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -50,11 +50,11 @@ def check_output(file: Path, data_dir: Path) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from app.card import card
-    from app.exports import csv_blocks, write_parquet
-    from trainer.answers import SKIP_COLUMNS
-    from trainer.files import write_atomic
-    from trainer.pairs import COMPARISON_COLUMNS
+    from onedemo.answers import SKIP_COLUMNS
+    from onedemo.app.card import card
+    from onedemo.app.exports import csv_blocks, write_parquet
+    from onedemo.files import write_atomic
+    from onedemo.pairs import COMPARISON_COLUMNS
 
     with open_store(arguments, must_exist=True) as store:
         run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
@@ -82,7 +82,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    from app.importing import import_data
+    from onedemo.app.importing import import_data
 
     there = import_data(arguments.ratings, arguments.segments, arguments.data_dir)
     print("  ".join(f"{count} {what}" for what, count in there.items()))
@@ -96,7 +96,7 @@ def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
     """
     from contextlib import closing
 
-    from trainer.store import FILE_NAME, Store
+    from onedemo.store import FILE_NAME, Store
 
     if must_exist and not (arguments.data_dir / FILE_NAME).exists():
         raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from app.cli_data import add_data_dir, check_output, open_store
-from trainer.errors import UserError
+from onedemo.app.cli_data import add_data_dir, check_output, open_store
+from onedemo.errors import UserError
 
 COMMAND_LINE = "command line"
 """Who did what is done here, as the audit log has it."""
@@ -43,8 +43,8 @@ def add_people_commands(commands: Any, command: Callable[..., argparse.ArgumentP
 
 
 def _add(arguments: argparse.Namespace) -> None:
-    from app.links import issue_link, passing_link, read_secret, read_span
-    from trainer.names import check_person
+    from onedemo.app.links import issue_link, passing_link, read_secret, read_span
+    from onedemo.names import check_person
 
     name = check_person(arguments.name)
     lasts = read_span(arguments.expires) if arguments.expires is not None else None
@@ -97,9 +97,9 @@ def _revoke(arguments: argparse.Namespace) -> None:
 
 
 def _audit(arguments: argparse.Namespace) -> None:
-    from app.exports import csv_blocks
-    from trainer.audit import AUDIT_COLUMNS
-    from trainer.files import write_atomic
+    from onedemo.app.exports import csv_blocks
+    from onedemo.audit import AUDIT_COLUMNS
+    from onedemo.files import write_atomic
 
     with open_store(arguments, must_exist=True) as store:
         if arguments.csv is not None:

@@ -10,16 +10,16 @@ from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from app.pair_desk import PairDesk
-from app.pictures import version_of
-from app.player import player_html
-from app.pressing import Pressing
-from app.rate_html import tools_html
-from app.words import COMPARE_KEYS, keys_dialog
-from trainer.records import Status
+from onedemo.app.pair_desk import PairDesk
+from onedemo.app.pictures import version_of
+from onedemo.app.player import player_html
+from onedemo.app.pressing import Pressing
+from onedemo.app.rate_html import tools_html
+from onedemo.app.words import COMPARE_KEYS, keys_dialog
+from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 _ANSWERS = (("1", "left", "The left one"), ("2", "equal", "Both alike"), ("3", "right", "The right one"))
 

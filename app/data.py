@@ -11,14 +11,14 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from app.charts import classes_html
-from app.quality import Quality, quality, quality_by_rater, rating_rows
-from app.words import ANSWERS, nobody_html
-from trainer.answers import SKIP_COLUMNS
-from trainer.records import Rater, Status
+from onedemo.answers import SKIP_COLUMNS
+from onedemo.app.charts import classes_html
+from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
+from onedemo.app.words import ANSWERS, nobody_html
+from onedemo.records import Rater, Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 log = logging.getLogger("onedemo.page")
 

@@ -13,13 +13,13 @@ from typing import Literal, NamedTuple
 
 from aiohttp import web
 
-from app import assets
-from app.limits import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
-from app.links import hash_token, new_session_token
-from app.listening import Listening
-from trainer.people import SESSION_DAYS, Link
-from trainer.records import Rater
-from trainer.store import Store
+from onedemo.app import assets
+from onedemo.app.limits import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
+from onedemo.app.links import hash_token, new_session_token
+from onedemo.app.listening import Listening
+from onedemo.people import SESSION_DAYS, Link
+from onedemo.records import Rater
+from onedemo.store import Store
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 Role = Literal["stranger", "annotator", "researcher"]

@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from app.parquet import write_segments
-from trainer.files import replacing
-from trainer.store import RATING_COLUMNS, Store
+from onedemo.app.parquet import write_segments
+from onedemo.files import replacing
+from onedemo.store import RATING_COLUMNS, Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 

@@ -8,10 +8,10 @@ from typing import Protocol
 
 from aiohttp import web
 
-from app import assets
-from app.pictures import Pictures
-from trainer.errors import UserError
-from trainer.store import Store
+from onedemo.app import assets
+from onedemo.app.pictures import Pictures
+from onedemo.errors import UserError
+from onedemo.store import Store
 
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Addresses of what differs between runs or demos end in ?v= and what they are of."""

@@ -1,6 +1,6 @@
 """The public HTTP port: one table of what there is and who may have it.
 
-``app.door`` says who asks, ``app.files`` and ``app.downloads`` hand out files, ``app.proxy`` carries
+``onedemo.app.door`` says who asks, ``onedemo.app.files`` and ``onedemo.app.downloads`` hand out files, ``onedemo.app.proxy`` carries
 the page's WebSocket to Viser. The page itself is Viser's single HTML file with our style sheet and
 key handling added.
 """
@@ -17,17 +17,17 @@ from typing import Any, Protocol
 
 from aiohttp import web
 
-from app import assets
-from app.actions import Actions
-from app.door import RATER, SECURITY_HEADERS, Door, Route
-from app.downloads import Downloads
-from app.files import Files, Filmed
-from app.listening import Listening
-from app.pictures import Pictures
-from app.proxy import Proxy
-from app.uploads import Uploads
-from trainer.errors import UserError
-from trainer.records import Status
+from onedemo.app import assets
+from onedemo.app.actions import Actions
+from onedemo.app.door import RATER, SECURITY_HEADERS, Door, Route
+from onedemo.app.downloads import Downloads
+from onedemo.app.files import Files, Filmed
+from onedemo.app.listening import Listening
+from onedemo.app.pictures import Pictures
+from onedemo.app.proxy import Proxy
+from onedemo.app.uploads import Uploads
+from onedemo.errors import UserError
+from onedemo.records import Status
 
 
 class Trained(Filmed, Protocol):

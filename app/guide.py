@@ -6,12 +6,12 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Any
 
-from app.player import example_address, player_html
-from app.words import ANSWERS, MEANINGS, keys_html
-from trainer.records import Status
+from onedemo.app.player import example_address, player_html
+from onedemo.app.words import ANSWERS, MEANINGS, keys_html
+from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 log = logging.getLogger("onedemo.page")
 

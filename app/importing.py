@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from app.columns import RATINGS
-from app.parquet import read_about, read_segments
-from trainer.errors import UserError
-from trainer.files import write_atomic
-from trainer.names import LONGEST, check_name
-from trainer.store import Store
+from onedemo.app.columns import RATINGS
+from onedemo.app.parquet import read_about, read_segments
+from onedemo.errors import UserError
+from onedemo.files import write_atomic
+from onedemo.names import LONGEST, check_name
+from onedemo.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
 
@@ -98,7 +98,7 @@ def _rows(file: Path) -> Iterator[dict[str, Any]]:
 
 
 def _armed(cell: str) -> str:
-    """A cell before it was made harmless to spreadsheets (``app.exports.defuse``)."""
+    """A cell before it was made harmless to spreadsheets (``onedemo.app.exports.defuse``)."""
     return cell[1:] if cell.startswith("'") and cell[1:2] in ("=", "+", "-", "@", "\t", "\r") else cell
 
 

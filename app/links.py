@@ -14,9 +14,9 @@ import secrets
 from datetime import timedelta
 from pathlib import Path
 
-from trainer.errors import UserError
-from trainer.records import Rater
-from trainer.store import Store
+from onedemo.errors import UserError
+from onedemo.records import Rater
+from onedemo.store import Store
 
 SECRET_FILE = "link-secret"
 SECRET_BYTES = 32

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 _HOST_NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]*[a-z0-9])?(\.[a-z0-9]([a-z0-9-]*[a-z0-9])?)*")
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from trainer import envs
-from trainer.rollouts import Acting
+from onedemo import envs
+from onedemo.rollouts import Acting
 
 log = logging.getLogger("onedemo.page")
 

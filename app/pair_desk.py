@@ -1,4 +1,4 @@
-"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``app.desk``."""
+"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``onedemo.app.desk``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 
-from app.assignment import Assignment, Seat
-from app.desk import GUARD_SECONDS, AnsweredElsewhere
-from trainer.records import Rater
-from trainer.store import Store
+from onedemo.app.assignment import Assignment, Seat
+from onedemo.app.desk import GUARD_SECONDS, AnsweredElsewhere
+from onedemo.records import Rater
+from onedemo.store import Store
 
 
 class PairDesk:

@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from app.columns import SEGMENTS
-from trainer.errors import UserError
-from trainer.records import ROLES, Clip, Segment
+from onedemo.app.columns import SEGMENTS
+from onedemo.errors import UserError
+from onedemo.records import ROLES, Clip, Segment
 
 _ARRAYS = ("obs", "actions", "qpos", "qvel")
 _RUNS, _ROLES = b"onedemo.runs", b"onedemo.raters"

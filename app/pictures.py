@@ -12,10 +12,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from trainer.clips import compose_clip
-from trainer.demos import read_frames
-from trainer.records import Demo
-from trainer.store import Store
+from onedemo.clips import compose_clip
+from onedemo.demos import read_frames
+from onedemo.records import Demo
+from onedemo.store import Store
 
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640

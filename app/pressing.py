@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from app.desk import AnsweredElsewhere
+from onedemo.app.desk import AnsweredElsewhere
 
 log = logging.getLogger("onedemo.page")
 

@@ -11,8 +11,8 @@ from typing import Protocol
 
 from aiohttp import ClientSession, ClientWebSocketResponse, WSCloseCode, WSMsgType, web
 
-from app.door import RATER, SESSION, same_origin
-from app.limits import (
+from onedemo.app.door import RATER, SESSION, same_origin
+from onedemo.app.limits import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
     LARGEST_MESSAGE,
@@ -23,8 +23,8 @@ from app.limits import (
     Bucket,
     Places,
 )
-from app.messages import known
-from trainer.store import Store
+from onedemo.app.messages import known
+from onedemo.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"

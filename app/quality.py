@@ -14,8 +14,8 @@ from typing import NamedTuple
 import krippendorff
 import numpy as np
 
-from trainer import envs
-from trainer.store import Store
+from onedemo import envs
+from onedemo.store import Store
 
 _CLASSES = 5
 _RESAMPLES = 400

@@ -9,15 +9,15 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from app import rate_html as html
-from app.desk import Desk
-from app.pictures import version_of
-from app.pressing import Pressing
-from app.words import ANSWERS, RATE_KEYS, keys_dialog
-from trainer.records import Status
+from onedemo.app import rate_html as html
+from onedemo.app.desk import Desk
+from onedemo.app.pictures import version_of
+from onedemo.app.pressing import Pressing
+from onedemo.app.words import ANSWERS, RATE_KEYS, keys_dialog
+from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 _MIDDLE = 3
 

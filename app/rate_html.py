@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from html import escape
 
-from app.desk import Desk
-from app.lesson import Lesson
-from app.player import example_address, player_html
-from app.words import ANSWERS, REASONS
-from trainer.records import Demo, Status
+from onedemo.app.desk import Desk
+from onedemo.app.lesson import Lesson
+from onedemo.app.player import example_address, player_html
+from onedemo.app.words import ANSWERS, REASONS
+from onedemo.records import Demo, Status
 
 SUBMIT = '<div class="od-submit"><button type="button" class="od-button" data-submit>Submit</button></div>'
 _QUESTION = "How alike are the two movements?"

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from app import charts
-from app.uploads import form_html
-from trainer.config import METHODS
-from trainer.demos import list_demos
-from trainer.records import HALTED, Status
+from onedemo.app import charts
+from onedemo.app.uploads import form_html
+from onedemo.config import METHODS
+from onedemo.demos import list_demos
+from onedemo.records import HALTED, Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 _NEWEST = 6
 """Runs that are compared before anybody says which."""

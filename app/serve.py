@@ -7,18 +7,18 @@ import sys
 import threading
 from pathlib import Path
 
-from app.assignment import Again
-from app.front import Front, check_port
-from app.links import issue_link, read_secret
-from app.listening import Listening
-from app.server import Page
-from app.study import Study
-from trainer.config import RunConfig
-from trainer.encoders import make_encoder
-from trainer.records import Demo
-from trainer.render import RenderThread
-from trainer.runs import add_run, find_run
-from trainer.store import Store
+from onedemo.app.assignment import Again
+from onedemo.app.front import Front, check_port
+from onedemo.app.links import issue_link, read_secret
+from onedemo.app.listening import Listening
+from onedemo.app.server import Page
+from onedemo.app.study import Study
+from onedemo.config import RunConfig
+from onedemo.encoders import make_encoder
+from onedemo.records import Demo
+from onedemo.render import RenderThread
+from onedemo.runs import add_run, find_run
+from onedemo.store import Store
 
 _SWITCH_SECONDS = 0.0005
 """A press passes through five threads. Each would wait Python's usual 5 ms for a trainer that computes."""

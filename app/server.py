@@ -19,16 +19,16 @@ import rich
 import viser
 from viser import _messages
 
-from app import data, guide, rate, runs, watch
-from app.assignment import Again, Ask, Assignment
-from app.compare import Compare
-from app.desk import Desk, Mark
-from app.live import Live
-from app.pictures import Pictures
-from app.proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
-from app.session import Session, TabMaker
-from app.study import Study
-from trainer.records import Rater
+from onedemo.app import data, guide, rate, runs, watch
+from onedemo.app.assignment import Again, Ask, Assignment
+from onedemo.app.compare import Compare
+from onedemo.app.desk import Desk, Mark
+from onedemo.app.live import Live
+from onedemo.app.pictures import Pictures
+from onedemo.app.proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
+from onedemo.app.session import Session, TabMaker
+from onedemo.app.study import Study
+from onedemo.records import Rater
 
 log = logging.getLogger("onedemo.page")
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
-from app.assignment import Ask
-from app.lesson import Lesson
-from trainer.records import Rater, Status
+from onedemo.app.assignment import Ask
+from onedemo.app.lesson import Lesson
+from onedemo.records import Rater, Status
 
 if TYPE_CHECKING:
-    from app.server import Page
+    from onedemo.app.server import Page
 
 _BRAND = (47, 93, 196)
 

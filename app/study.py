@@ -9,18 +9,18 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from trainer.config import METHODS, RunConfig, load_config, settings_for_another
-from trainer.demos import find_demo
-from trainer.encoders import make_encoder
-from trainer.errors import UserError
-from trainer.files import hold
-from trainer.loop import Trainer
-from trainer.predictor import Snapshot, check_start
-from trainer.records import Demo
-from trainer.render import RenderThread
-from trainer.runs import add_run, find_run
-from trainer.store import Store
-from trainer.transfer import newest_snapshot
+from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
+from onedemo.demos import find_demo
+from onedemo.encoders import make_encoder
+from onedemo.errors import UserError
+from onedemo.files import hold
+from onedemo.loop import Trainer
+from onedemo.predictor import Snapshot, check_start
+from onedemo.records import Demo
+from onedemo.render import RenderThread
+from onedemo.runs import add_run, find_run
+from onedemo.store import Store
+from onedemo.transfer import newest_snapshot
 
 
 class Study:

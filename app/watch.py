@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 from mjviser import ViserMujocoScene
 
-from app import charts, progress
-from app.live import Moment
-from app.pictures import version_of
-from app.words import nobody_html
-from trainer.records import HALTED, Status
+from onedemo.app import charts, progress
+from onedemo.app.live import Moment
+from onedemo.app.pictures import version_of
+from onedemo.app.words import nobody_html
+from onedemo.records import HALTED, Status
 
 if TYPE_CHECKING:
-    from app.session import Session
+    from onedemo.app.session import Session
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""

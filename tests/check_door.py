@@ -35,16 +35,16 @@ import numpy as np
 import viser
 from standin import StandIn
 
-from app.assignment import Again
-from app.front import Front
-from app.links import issue_link, read_secret
-from app.listening import Listening
-from app.pictures import Pictures
-from app.server import Page
-from trainer.demos import import_video
-from trainer.errors import UserError
-from trainer.guarded import Limits
-from trainer.video import write_webm
+from onedemo.app.assignment import Again
+from onedemo.app.front import Front
+from onedemo.app.links import issue_link, read_secret
+from onedemo.app.listening import Listening
+from onedemo.app.pictures import Pictures
+from onedemo.app.server import Page
+from onedemo.demos import import_video
+from onedemo.errors import UserError
+from onedemo.guarded import Limits
+from onedemo.video import write_webm
 
 FULL = {"messages": 100_000, "requests": 10_000, "videos": 500}
 QUICK = {"messages": 1_000, "requests": 200, "videos": 6}

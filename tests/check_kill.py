@@ -22,10 +22,10 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from trainer.bench.annotators import browser_session, open_tab, rating
-from trainer.bench.painted import CHROMIUM_FLAGS, find_chromium
-from trainer.bench.serving import Server, annotator_link
-from trainer.store import FILE_NAME, Store
+from onedemo.bench.annotators import browser_session, open_tab, rating
+from onedemo.bench.painted import CHROMIUM_FLAGS, find_chromium
+from onedemo.bench.serving import Server, annotator_link
+from onedemo.store import FILE_NAME, Store
 
 SETTINGS = [
     "predictor.appearance=false", "ratings.pretrain=30", "ratings.online=1000000", "ratings.rounds=2",

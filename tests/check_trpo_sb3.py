@@ -14,10 +14,10 @@ import gymnasium
 import numpy as np
 import torch
 
-from trainer import envs
-from trainer.policy import Policy, PolicyConfig
-from trainer.rollouts import Collector, evaluate
-from trainer.trpo import Trpo, TrpoConfig
+from onedemo import envs
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.rollouts import Collector, evaluate
+from onedemo.trpo import Trpo, TrpoConfig
 
 LANES, BATCH, EPISODES = 16, 128, 16
 CONFIG = TrpoConfig(

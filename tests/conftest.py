@@ -27,8 +27,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     The robot is learned from fewer pictures than it is for people: a minute less.
     """
-    from trainer import appearance
-    from trainer.encoders import make_encoder
+    from onedemo import appearance
+    from onedemo.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("results")
     with pytest.MonkeyPatch.context() as patch:
@@ -40,7 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
-    from trainer.bench.painted import CHROMIUM_FLAGS, find_chromium
+    from onedemo.bench.painted import CHROMIUM_FLAGS, find_chromium
 
     path = find_chromium()
     if path is None:
@@ -59,8 +59,8 @@ def chromium() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
-    from trainer import appearance
-    from trainer.encoders import make_encoder
+    from onedemo import appearance
+    from onedemo.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("looked") / "robots"
     with pytest.MonkeyPatch.context() as patch:
@@ -94,15 +94,17 @@ class Site:
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
-    monkeypatch.setattr("app.live.FRAMES_PER_SECOND", 5.0)  # without a GPU each costs a tenth of a second
+    monkeypatch.setattr(
+        "onedemo.app.live.FRAMES_PER_SECOND", 5.0
+    )  # without a GPU each costs a tenth of a second
     from standin import StandIn
 
-    from app.assignment import Again
-    from app.front import Front
-    from app.links import issue_link, read_secret
-    from app.listening import Listening
-    from app.pictures import Pictures
-    from app.server import Page
+    from onedemo.app.assignment import Again
+    from onedemo.app.front import Front
+    from onedemo.app.links import issue_link, read_secret
+    from onedemo.app.listening import Listening
+    from onedemo.app.pictures import Pictures
+    from onedemo.app.server import Page
 
     trainer = StandIn(tmp_path)
     page = Page(

@@ -20,13 +20,13 @@ from typing import Any
 import torch
 import worlds
 
-import trainer.learner
-import trainer.practice
-from trainer import files
-from trainer.headless import train
-from trainer.predictor import Snapshot
-from trainer.records import Demo
-from trainer.store import FILE_NAME, Store
+import onedemo.learner
+import onedemo.practice
+from onedemo import files
+from onedemo.headless import train
+from onedemo.predictor import Snapshot
+from onedemo.records import Demo
+from onedemo.store import FILE_NAME, Store
 
 MOMENTS = {
     "amid the first ratings": ("store", "rate", 2, True),
@@ -50,7 +50,7 @@ def die() -> None:
 def arm(moment: str) -> None:
     """Sees to it that this process dies at that moment."""
     owner, name, call, after = MOMENTS[moment]
-    where = {"store": Store, "snapshot": Snapshot, "os": files.os, "learner": trainer.learner.Learner}[owner]
+    where = {"store": Store, "snapshot": Snapshot, "os": files.os, "learner": onedemo.learner.Learner}[owner]
     whole, calls = getattr(where, name), 0
 
     def dying(*args, **kwargs):
@@ -68,7 +68,7 @@ def arm(moment: str) -> None:
 
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
-    trainer.learner._WILD_LANES, trainer.practice._BANK_TRIES = 4, 200
+    onedemo.learner._WILD_LANES, onedemo.practice._BANK_TRIES = 4, 200
     config = worlds.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))

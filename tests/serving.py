@@ -19,7 +19,15 @@ class Serving:
         """The process, its links once it is ready (none if it ends before), and what it says on stderr."""
         log = self.data_dir.with_name(f"{self.data_dir.name}.log")
         errors = self._stack.enter_context(log.open("w"))
-        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(self.data_dir), *options]
+        command = [
+            sys.executable,
+            "-m",
+            "onedemo.app.cli",
+            "serve",
+            "--data-dir",
+            str(self.data_dir),
+            *options,
+        ]
         child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
         self._stack.callback(self._end, child)
         assert child.stdout is not None

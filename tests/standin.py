@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.records import Demo, Segment, Status
-from trainer.rollouts import Acting, EpisodeRules
-from trainer.store import NewClip, Store
+from onedemo.records import Demo, Segment, Status
+from onedemo.rollouts import Acting, EpisodeRules
+from onedemo.store import NewClip, Store
 
 FPS = 30.0
 SIZE = (360, 480)
@@ -74,7 +74,7 @@ class StandIn:
         self.add_clips(clips)
 
     def add_clips(self, count: int) -> list[int]:
-        from trainer.clips import compose_clip
+        from onedemo.clips import compose_clip
 
         new = [
             NewClip(demo_step=25 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
@@ -108,8 +108,8 @@ class StandIn:
         return self.directory / f"pair-{pair_id}.jpg"
 
     def add_pairs(self, count: int) -> list[int]:
-        from trainer.clips import compose_clip
-        from trainer.pairs import NewPair
+        from onedemo.clips import compose_clip
+        from onedemo.pairs import NewPair
 
         pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)
         ids = [pair.id for pair in self.store.add_pairs(self.run, [pair] * count)]
@@ -120,7 +120,7 @@ class StandIn:
         return ids
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
-        from trainer.video import write_webm
+        from onedemo.video import write_webm
 
         if not 1 <= iteration <= len(self.store.iterations(self.run)):
             raise FileNotFoundError(iteration)

@@ -7,11 +7,11 @@ import pytest
 import torch
 from worlds import FRAME_STEPS, Thumbnail, falling_states
 
-from trainer import appearance, body
-from trainer.appearance import Appearance, learn, pictures, regress
-from trainer.demos import list_demos, stream_frames
-from trainer.encoders import make_encoder
-from trainer.render import HEIGHT, WIDTH, Renderer
+from onedemo import appearance, body
+from onedemo.appearance import Appearance, learn, pictures, regress
+from onedemo.demos import list_demos, stream_frames
+from onedemo.encoders import make_encoder
+from onedemo.render import HEIGHT, WIDTH, Renderer
 
 
 @pytest.fixture(scope="module", autouse=True)

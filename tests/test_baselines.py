@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from trainer import envs
-from trainer.baselines import handcoded, trajopt
-from trainer.errors import UserError
-from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from trainer.motion import (
+from onedemo import envs
+from onedemo.baselines import handcoded, trajopt
+from onedemo.errors import UserError
+from onedemo.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
+from onedemo.motion import (
     backflip_reward,
     clean_turns,
     clearances,
@@ -21,8 +21,8 @@ from trainer.motion import (
     task_reward,
     until_fall,
 )
-from trainer.policy import Policy, PolicyConfig
-from trainer.rollouts import evaluate
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.rollouts import evaluate
 
 DEMOS = Path(__file__).parent.parent / "static" / "demos"
 

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from app.cli import main
-from trainer.bench import report, speed
-from trainer.bench.figures import Figure, Growth, Skipped, by_turns, ratio, single
+from onedemo.app.cli import main
+from onedemo.bench import report, speed
+from onedemo.bench.figures import Figure, Growth, Skipped, by_turns, ratio, single
 
 
 def made_up():
@@ -80,7 +80,7 @@ def test_report(tmp_path):
 
 
 def test_a_part_that_fails_does_not_lose_the_others(monkeypatch):
-    from trainer.bench import fitting, physics
+    from onedemo.bench import fitting, physics
 
     def broken(quick):
         raise RuntimeError("no luck")
@@ -93,7 +93,7 @@ def test_a_part_that_fails_does_not_lose_the_others(monkeypatch):
 
 
 def test_a_failed_part_fails_the_command(monkeypatch, capsys):
-    from trainer.bench import fitting
+    from onedemo.bench import fitting
 
     monkeypatch.setattr(fitting, "measure", lambda quick: 1 / 0)
     assert main(["bench", "speed", "--part", "fitting"]) == 1
@@ -131,9 +131,9 @@ def test_quick_run_of_physics_and_training(tmp_path, capsys):
 
 
 def test_made_up_ratings_are_skewed_like_those_of_a_random_policy():
-    from trainer.bench.training import made_up_ratings
-    from trainer.config import load_config
-    from trainer.learner import Learner
+    from onedemo.bench.training import made_up_ratings
+    from onedemo.config import load_config
+    from onedemo.learner import Learner
 
     learner = Learner(load_config(None, {"method": "paper"}), 240, 30.0)
     ratings = made_up_ratings(learner.random_rollouts(), 200, learner.clip_steps)

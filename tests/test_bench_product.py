@@ -10,9 +10,9 @@ from dataclasses import replace
 import aside
 import pytest
 
-from trainer.bench import crowd, painted, product
-from trainer.bench.annotators import Press, browser_session, open_tab
-from trainer.bench.serving import Server, check_counts, give, stocked
+from onedemo.bench import crowd, painted, product
+from onedemo.bench.annotators import Press, browser_session, open_tab
+from onedemo.bench.serving import Server, check_counts, give, stocked
 
 pytestmark = pytest.mark.seam
 

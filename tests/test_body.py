@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from trainer import body, envs
-from trainer.motion import clearances
-from trainer.raters import appearance
-from trainer.starts import random_states, wild_rollouts
+from onedemo import body, envs
+from onedemo.motion import clearances
+from onedemo.raters import appearance
+from onedemo.starts import random_states, wild_rollouts
 
 HOPPER = envs.spec("hopper")
 

@@ -23,18 +23,18 @@ from test_demos import make_video
 from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
 
-from app.cli import main
-from app.links import read_secret
-from trainer.asking import Simulated
-from trainer.backup import MANIFEST, back_up, restore
-from trainer.bench.annotators import browser_session, open_tab, rating
-from trainer.bench.serving import reach, serving
-from trainer.clips import compose_clip
-from trainer.demos import import_video
-from trainer.errors import UserError
-from trainer.files import archive_fault, jpeg_fault, read_whole, sealed
-from trainer.predictor import Snapshot
-from trainer.store import FILE_NAME, Store
+from onedemo.app.cli import main
+from onedemo.app.links import read_secret
+from onedemo.asking import Simulated
+from onedemo.backup import MANIFEST, back_up, restore
+from onedemo.bench.annotators import browser_session, open_tab, rating
+from onedemo.bench.serving import reach, serving
+from onedemo.clips import compose_clip
+from onedemo.demos import import_video
+from onedemo.errors import UserError
+from onedemo.files import archive_fault, jpeg_fault, read_whole, sealed
+from onedemo.predictor import Snapshot
+from onedemo.store import FILE_NAME, Store
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
 
@@ -357,7 +357,7 @@ def test_the_doctor_names_what_is_wrong(data_dir, capsys, harm, said):
 
 @pytest.mark.slow
 def test_the_doctor_says_when_nothing_can_be_drawn(tmp_path):
-    command = [sys.executable, "-m", "app.cli", "doctor", "--data-dir", str(tmp_path / "none")]
+    command = [sys.executable, "-m", "onedemo.app.cli", "doctor", "--data-dir", str(tmp_path / "none")]
     child = subprocess.run(command, env=os.environ | {"MUJOCO_GL": "off"}, capture_output=True, text=True)
     assert child.returncode == 1 and "BAD  pictures         cannot draw the robot" in child.stdout
     assert "none in" in child.stdout
@@ -381,7 +381,7 @@ def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, robots):
             return [(press.clip, press.value) for press in tab.presses]
 
     def save():
-        command = [sys.executable, "-m", "app.cli", "backup", str(file), "--data-dir", str(data_dir)]
+        command = [sys.executable, "-m", "onedemo.app.cli", "backup", str(file), "--data-dir", str(data_dir)]
         subprocess.run(command, check=True, capture_output=True)
 
     with serving(data_dir, ["ratings.pretrain=100"]) as server:

@@ -3,8 +3,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from trainer.choice import choose
-from trainer.records import Rollouts
+from onedemo.choice import choose
+from onedemo.records import Rollouts
 
 
 def rollouts(clock):

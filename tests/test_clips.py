@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from trainer.backdrop import Camera, backdrop
-from trainer.clips import (
+from onedemo.backdrop import Camera, backdrop
+from onedemo.clips import (
     CLIP_HEIGHT,
     CLIP_WIDTH,
     GAP,

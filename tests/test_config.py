@@ -2,15 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from trainer.config import (
-    METHODS,
-    RunConfig,
-    load_config,
-    parse_override,
-    settings_for_another,
-    to_toml,
-)
-from trainer.errors import UserError
+from onedemo.config import METHODS, RunConfig, load_config, parse_override, settings_for_another, to_toml
+from onedemo.errors import UserError
 
 
 def test_defaults_are_the_papers_numbers():

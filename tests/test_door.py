@@ -17,15 +17,15 @@ import msgspec
 import pytest
 from aside import run
 
-from app.cli import main
-from app.limits import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Buckets, Places
-from app.links import hash_token, passing_link, read_span
-from app.listening import Listening
-from app.messages import known
-from trainer.bench.annotators import browser_session, open_tab
-from trainer.errors import UserError
-from trainer.names import check_name, check_person
-from trainer.store import Store
+from onedemo.app.cli import main
+from onedemo.app.limits import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Buckets, Places
+from onedemo.app.links import hash_token, passing_link, read_span
+from onedemo.app.listening import Listening
+from onedemo.app.messages import known
+from onedemo.bench.annotators import browser_session, open_tab
+from onedemo.errors import UserError
+from onedemo.names import check_name, check_person
+from onedemo.store import Store
 
 ROOT = Path(__file__).parents[1]
 CAMERA = {
@@ -85,7 +85,7 @@ def test_a_strangers_name_for_this_machine_gets_nothing(site):
 
 @pytest.mark.seam
 def test_the_page_can_be_served_encrypted(site, tmp_path):
-    from app.front import Front
+    from onedemo.app.front import Front
 
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost",
@@ -110,7 +110,7 @@ def test_the_page_can_be_served_encrypted(site, tmp_path):
 
 @pytest.mark.seam
 def test_a_proxy_is_believed_only_where_there_is_one(site):
-    from app.front import Front
+    from onedemo.app.front import Front
 
     asked = {"X-Forwarded-For": "6.6.6.6, 10.0.0.9", "X-Forwarded-Proto": "https"}
     link = site.links["annotator"].removeprefix(site.url)

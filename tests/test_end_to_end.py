@@ -13,8 +13,8 @@ import pytest
 from serving import Serving
 from test_page import drag_slider, opened, shown_clip, until
 
-from app.cli import main
-from trainer.store import FILE_NAME
+from onedemo.app.cli import main
+from onedemo.store import FILE_NAME
 
 pytestmark = pytest.mark.seam
 

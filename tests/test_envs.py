@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from trainer import envs
-from trainer.errors import UserError
+from onedemo import envs
+from onedemo.errors import UserError
 
 STEPS = 300
 

@@ -5,15 +5,15 @@ import itertools
 import numpy as np
 import pytest
 
-from trainer import envs
-from trainer.alignment import align
-from trainer.bench.controls import TrueRating
-from trainer.demos import BUILT_IN, find_demo
-from trainer.evaluation import aligned_similarity, per_episode, spread, state_errors
-from trainer.hidden import load_hidden
-from trainer.raters import Oracle
-from trainer.rollouts import Episodes
-from trainer.timing import steps_of_frames
+from onedemo import envs
+from onedemo.alignment import align
+from onedemo.bench.controls import TrueRating
+from onedemo.demos import BUILT_IN, find_demo
+from onedemo.evaluation import aligned_similarity, per_episode, spread, state_errors
+from onedemo.hidden import load_hidden
+from onedemo.raters import Oracle
+from onedemo.rollouts import Episodes
+from onedemo.timing import steps_of_frames
 
 
 @pytest.fixture(scope="module")

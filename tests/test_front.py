@@ -14,14 +14,14 @@ import pytest
 import viser
 from aside import run
 
-from app import exports
-from app.door import Door
-from app.front import Front, check_port
-from app.links import issue_link, read_secret
-from app.listening import Listening
-from app.pictures import version_of
-from trainer.errors import UserError
-from trainer.store import RATING_COLUMNS, Store
+from onedemo.app import exports
+from onedemo.app.door import Door
+from onedemo.app.front import Front, check_port
+from onedemo.app.links import issue_link, read_secret
+from onedemo.app.listening import Listening
+from onedemo.app.pictures import version_of
+from onedemo.errors import UserError
+from onedemo.store import RATING_COLUMNS, Store
 
 pytestmark = pytest.mark.seam
 

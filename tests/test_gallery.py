@@ -7,10 +7,10 @@ import pytest
 from test_choice import rollouts as empty_rollouts
 from worlds import falling_demo, falling_states
 
-from app.progress import chosen, gallery_html, timeline_html
-from trainer.gallery import PARTS, Episode, Gallery
-from trainer.render import RenderThread
-from trainer.video import VideoReader, count_frames
+from onedemo.app.progress import chosen, gallery_html, timeline_html
+from onedemo.gallery import PARTS, Episode, Gallery
+from onedemo.render import RenderThread
+from onedemo.video import VideoReader, count_frames
 
 
 class ByLane:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from test_demos import make_video, refused
 
-from trainer import guarded
-from trainer.errors import UserError
-from trainer.guarded import Limits, Options, decode
+from onedemo import guarded
+from onedemo.errors import UserError
+from onedemo.guarded import Limits, Options, decode
 
 pytestmark = pytest.mark.seam
 
@@ -72,7 +72,7 @@ def test_a_bomb_is_refused_without_growing(tmp_path, library, make, suffix, word
 
 
 def test_more_frames_than_anybody_needs(tmp_path, library, monkeypatch):
-    monkeypatch.setattr("trainer.demo_checks.MAX_FRAMES", 20)
+    monkeypatch.setattr("onedemo.demo_checks.MAX_FRAMES", 20)
     with pytest.raises(UserError, match="more than 20 frames"):
         list(guarded.shaped_frames(make_video(tmp_path / "a.avi", count=30), Options()))
 
@@ -112,7 +112,7 @@ def test_the_child_is_gone_when_nobody_wants_more(tmp_path):
 
 def _children():
     listing = [p.read_text() for p in Path("/proc").glob("[0-9]*/cmdline") if _mine(p.parent)]
-    return [line for line in listing if "trainer.guarded" in line]
+    return [line for line in listing if "onedemo.guarded" in line]
 
 
 def _mine(process):

@@ -9,16 +9,16 @@ import pyarrow.parquet as pq
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from app.card import card
-from app.cli import main
-from app.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
-from trainer.asking import Simulated
-from trainer.config import load_config
-from trainer.learner import Learner
-from trainer.loop import Trainer
-from trainer.runs import add_run
-from trainer.store import RATING_COLUMNS, Store
-from trainer.training_set import TrainingSet
+from onedemo.app.card import card
+from onedemo.app.cli import main
+from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
+from onedemo.asking import Simulated
+from onedemo.config import load_config
+from onedemo.learner import Learner
+from onedemo.loop import Trainer
+from onedemo.runs import add_run
+from onedemo.store import RATING_COLUMNS, Store
+from onedemo.training_set import TrainingSet
 
 
 def by_rule(segment, demo_step):

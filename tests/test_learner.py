@@ -3,12 +3,12 @@ import pytest
 import torch
 from worlds import FRAMES, STEPS, falling_states, falling_track, small_config
 
-from trainer.errors import UserError
-from trainer.evaluation import summarise
-from trainer.learner import Learner
-from trainer.metric import MetricSnapshot
-from trainer.rollouts import evaluate
-from trainer.store import RatedSegment
+from onedemo.errors import UserError
+from onedemo.evaluation import summarise
+from onedemo.learner import Learner
+from onedemo.metric import MetricSnapshot
+from onedemo.rollouts import evaluate
+from onedemo.store import RatedSegment
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +19,8 @@ def features():
 @pytest.fixture(autouse=True)
 def few_random_states(monkeypatch):
     """A run draws 61,440 of them, which takes a while."""
-    monkeypatch.setattr("trainer.learner._WILD_LANES", 8)
-    monkeypatch.setattr("trainer.practice._BANK_TRIES", 1000)
+    monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
+    monkeypatch.setattr("onedemo.practice._BANK_TRIES", 1000)
     torch.set_num_threads(1)  # as a run does
 
 

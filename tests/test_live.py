@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from standin import Wobble
 
-from app.live import Live
-from trainer.rollouts import Acting, EpisodeRules
+from onedemo.app.live import Live
+from onedemo.rollouts import Acting, EpisodeRules
 
 
 class Hurrying(EpisodeRules):

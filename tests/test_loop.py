@@ -11,18 +11,18 @@ import pytest
 import torch
 from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
-import trainer
-from trainer import envs
-from trainer.appearance import regress
-from trainer.asking import Simulated, due_in_round
-from trainer.headless import train
-from trainer.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from trainer.loop import Trainer
-from trainer.metric import MetricSnapshot
-from trainer.practice import PracticeRules
-from trainer.rollouts import EpisodeRules, evaluate
-from trainer.runs import add_run, find_run
-from trainer.store import Store
+import onedemo
+from onedemo import envs
+from onedemo.appearance import regress
+from onedemo.asking import Simulated, due_in_round
+from onedemo.headless import train
+from onedemo.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
+from onedemo.loop import Trainer
+from onedemo.metric import MetricSnapshot
+from onedemo.practice import PracticeRules
+from onedemo.rollouts import EpisodeRules, evaluate
+from onedemo.runs import add_run, find_run
+from onedemo.store import Store
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
         raise FloatingPointError("the policy has exploded")
 
     with monkeypatch.context() as broken:
-        broken.setattr("trainer.learner.Learner.iterate", break_down)
+        broken.setattr("onedemo.learner.Learner.iterate", break_down)
         trainer_.start()
         wait_for(lambda: rate_all(store, "r", ann) or trainer_.status().phase == "failed")
         assert trainer_.status().error == "FloatingPointError: the policy has exploded"
@@ -206,8 +206,8 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
 @pytest.fixture
 def few_wild(monkeypatch):
     """Random states are drawn and tried in seconds."""
-    monkeypatch.setattr("trainer.learner._WILD_LANES", 4)
-    monkeypatch.setattr("trainer.practice._BANK_TRIES", 200)
+    monkeypatch.setattr("onedemo.learner._WILD_LANES", 4)
+    monkeypatch.setattr("onedemo.practice._BANK_TRIES", 200)
 
 
 @pytest.mark.slow
@@ -223,7 +223,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
             rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
         )
 
-    monkeypatch.setattr("trainer.loop.learn_appearance", look)
+    monkeypatch.setattr("onedemo.loop.learn_appearance", look)
     trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
     trainer_.start()
     for _ in range(3):
@@ -384,7 +384,7 @@ LEARNING = (
 
 
 def imports_of(module):
-    source = Path(trainer.__file__).parent / f"{module.replace('.', '/')}.py"
+    source = Path(onedemo.__file__).parent / f"{module.replace('.', '/')}.py"
     found = set()
     for node in ast.walk(ast.parse(source.read_text())):
         names = []
@@ -392,8 +392,8 @@ def imports_of(module):
             names = [node.module] + [f"{node.module}.{alias.name}" for alias in node.names]
         elif isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        found |= {name.removeprefix("trainer.") for name in names if name.startswith("trainer.")}
-    folder = Path(trainer.__file__).parent
+        found |= {name.removeprefix("onedemo.") for name in names if name.startswith("onedemo.")}
+    folder = Path(onedemo.__file__).parent
     return {name for name in found if (folder / f"{name.replace('.', '/')}.py").exists()}
 
 
@@ -487,10 +487,10 @@ def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_
 @pytest.fixture
 def few_pictures(monkeypatch):
     """Of the robot, and few random states: enough to see poses by, if badly."""
-    monkeypatch.setattr("trainer.appearance.PICTURES", 80)
-    monkeypatch.setattr("trainer.appearance._EPOCHS", 4)
-    monkeypatch.setattr("trainer.learner._WILD_LANES", 8)
-    monkeypatch.setattr("trainer.practice._BANK_TRIES", 500)
+    monkeypatch.setattr("onedemo.appearance.PICTURES", 80)
+    monkeypatch.setattr("onedemo.appearance._EPOCHS", 4)
+    monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
+    monkeypatch.setattr("onedemo.practice._BANK_TRIES", 500)
 
 
 ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}

@@ -5,11 +5,11 @@ import tracemalloc
 
 import pytest
 
-from app.data import data_html
-from app.exports import csv_blocks
-from app.quality import quality, quality_by_rater, rating_rows
-from trainer.bench.data import _RUN, _ask_all, _begin, _fill, _press
-from trainer.store import RATING_COLUMNS, Store
+from onedemo.app.data import data_html
+from onedemo.app.exports import csv_blocks
+from onedemo.app.quality import quality, quality_by_rater, rating_rows
+from onedemo.bench.data import _RUN, _ask_all, _begin, _fill, _press
+from onedemo.store import RATING_COLUMNS, Store
 
 
 @pytest.fixture

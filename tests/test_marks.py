@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer.judge import Judge
-from trainer.marks import marked_steps, seconds_of_pictures, split_marks
-from trainer.records import Segment
-from trainer.store import NewClip, RatedSegment, Store
-from trainer.timing import frame_of_step
-from trainer.training_set import TrainingSet
+from onedemo.judge import Judge
+from onedemo.marks import marked_steps, seconds_of_pictures, split_marks
+from onedemo.records import Segment
+from onedemo.store import NewClip, RatedSegment, Store
+from onedemo.timing import frame_of_step
+from onedemo.training_set import TrainingSet
 
 W = 20
 
@@ -108,8 +108,8 @@ def test_a_simulated_rater_marks_the_worst_stretch(distances, mark):
 
 def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
     """Each clip is off in one number in its first half and in another in its second; all are rated alike."""
-    from trainer.metric import fit
-    from trainer.predictor import PredictorConfig
+    from onedemo.metric import fit
+    from onedemo.predictor import PredictorConfig
 
     ratings, frames, view, weight_of = view_of_two
     config = PredictorConfig(members=1)
@@ -122,9 +122,9 @@ def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
 @pytest.fixture
 def view_of_two():
     """Ratings whose marks blame the spin, not the height; and which log weights tell."""
-    from trainer import body
-    from trainer.appearance import Track
-    from trainer.predictor import View
+    from onedemo import body
+    from onedemo.appearance import Track
+    from onedemo.predictor import View
 
     rng = np.random.default_rng(0)
     still = np.zeros(11)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from trainer import body
-from trainer.appearance import Track
-from trainer.imagined import track_basis
-from trainer.metric import MetricSnapshot
-from trainer.predictor import PredictorConfig, Snapshot, View, fit
-from trainer.records import Segment
-from trainer.starts import wild_rollouts
-from trainer.store import RatedSegment
+from onedemo import body
+from onedemo.appearance import Track
+from onedemo.imagined import track_basis
+from onedemo.metric import MetricSnapshot
+from onedemo.predictor import PredictorConfig, Snapshot, View, fit
+from onedemo.records import Segment
+from onedemo.starts import wild_rollouts
+from onedemo.store import RatedSegment
 
 STEPS, FRAMES = 38, 60
 WEIGHTS = np.repeat([[1.0], [0.2]], body.POSE, axis=1)

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from trainer import envs, motion
-from trainer.demos import BUILT_IN
-from trainer.hidden import load_hidden
+from onedemo import envs, motion
+from onedemo.demos import BUILT_IN
+from onedemo.hidden import load_hidden
 
 DT = 0.008
 

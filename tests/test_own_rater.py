@@ -7,16 +7,16 @@ import pytest
 from test_scripted import Untouchable
 from worlds import STEPS, Thumbnail, falling_demo, small_config
 
-from trainer.clips import fit
-from trainer.demos import read_frames
-from trainer.errors import UserError
-from trainer.headless import train
-from trainer.hidden import hidden_path, load_hidden
-from trainer.judge import RatingBudgetSpent
-from trainer.raters import make_rater
-from trainer.records import Segment
-from trainer.render import Renderer
-from trainer.store import Store
+from onedemo.clips import fit
+from onedemo.demos import read_frames
+from onedemo.errors import UserError
+from onedemo.headless import train
+from onedemo.hidden import hidden_path, load_hidden
+from onedemo.judge import RatingBudgetSpent
+from onedemo.raters import make_rater
+from onedemo.records import Segment
+from onedemo.render import Renderer
+from onedemo.store import Store
 
 SOURCE = """
 import numpy as np

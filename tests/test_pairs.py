@@ -9,20 +9,20 @@ import pytest
 from test_choice import rollouts
 from worlds import falling_demo, falling_states, small_config
 
-from app.assignment import Assignment
-from app.cli import main
-from app.columns import COMPARISONS
-from app.desk import AnsweredElsewhere
-from app.pair_desk import PairDesk
-from trainer.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
-from trainer.demos import read_frames
-from trainer.errors import UserError
-from trainer.learner import Learner
-from trainer.pairing import Pairing, draw_pairs
-from trainer.pairs import COMPARISON_COLUMNS, NewPair
-from trainer.records import Segment
-from trainer.render import RenderThread
-from trainer.store import Store
+from onedemo.app.assignment import Assignment
+from onedemo.app.cli import main
+from onedemo.app.columns import COMPARISONS
+from onedemo.app.desk import AnsweredElsewhere
+from onedemo.app.pair_desk import PairDesk
+from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
+from onedemo.demos import read_frames
+from onedemo.errors import UserError
+from onedemo.learner import Learner
+from onedemo.pairing import Pairing, draw_pairs
+from onedemo.pairs import COMPARISON_COLUMNS, NewPair
+from onedemo.records import Segment
+from onedemo.render import RenderThread
+from onedemo.store import Store
 
 
 def segment(value=0.0, steps=38):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.inputs import HARMONICS, KINDS, feature_size, policy_inputs
-from trainer.policy import Normaliser, Policy, PolicyConfig, Tanh, ValueFunction, mlp
+from onedemo.inputs import HARMONICS, KINDS, feature_size, policy_inputs
+from onedemo.policy import Normaliser, Policy, PolicyConfig, Tanh, ValueFunction, mlp
 
 
 def policy(kind="clock", seed=0, table=None):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from trainer import envs
-from trainer.policy import Policy, PolicyConfig
-from trainer.practice import Bank, PracticeConfig, PracticeRules, fill_bank
-from trainer.predictor import PredictorConfig, Snapshot
-from trainer.rollouts import Collector, Step
-from trainer.starts import wild_rollouts
+from onedemo import envs
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.practice import Bank, PracticeConfig, PracticeRules, fill_bank
+from onedemo.predictor import PredictorConfig, Snapshot
+from onedemo.rollouts import Collector, Step
+from onedemo.starts import wild_rollouts
 
 DEMO_STEPS = 400
 DT = 0.01

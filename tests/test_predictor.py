@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from trainer.network import SimilarityNet, class_weights, standard_inputs
-from trainer.predictor import PredictorConfig, Snapshot, View, fit, visual_inputs
-from trainer.records import Segment
-from trainer.store import RatedSegment
+from onedemo.network import SimilarityNet, class_weights, standard_inputs
+from onedemo.predictor import PredictorConfig, Snapshot, View, fit, visual_inputs
+from onedemo.records import Segment
+from onedemo.store import RatedSegment
 
 FRAMES = 60
 

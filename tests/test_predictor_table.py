@@ -5,12 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from trainer import appearance
-from trainer.bench import document, predictor_table
-from trainer.bench.blocks import Bars, Bullets, Chart, Table
-from trainer.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
-from trainer.bench.predictor_figures import PAPER, TEST, findings
-from trainer.bench.predictor_scores import (
+from onedemo import appearance
+from onedemo.bench import document, predictor_table
+from onedemo.bench.blocks import Bars, Bullets, Chart, Table
+from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
+from onedemo.bench.predictor_figures import PAPER, TEST, findings
+from onedemo.bench.predictor_scores import (
     calibration_error,
     confusion,
     f1,
@@ -19,10 +19,10 @@ from trainer.bench.predictor_scores import (
     reliability,
     spearman,
 )
-from trainer.bench.predictor_trial import VARIANTS, run
-from trainer.bench.study import Outcome, kind_of
-from trainer.bench.worker import find_function
-from trainer.config import load_config
+from onedemo.bench.predictor_trial import VARIANTS, run
+from onedemo.bench.study import Outcome, kind_of
+from onedemo.bench.worker import find_function
+from onedemo.config import load_config
 
 # Scores
 

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from app.cli import main
-from trainer import envs
-from trainer.baselines import preferences, reward_model
-from trainer.baselines.comparer import Comparer, ComparisonBudgetSpent, agreement
-from trainer.baselines.preferences import PreferencesConfig, comparisons_due, draw_pairs, train_preferences
-from trainer.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
-from trainer.errors import UserError
-from trainer.hidden import load_hidden
-from trainer.motion import backflip_reward
-from trainer.policy import Policy, PolicyConfig
-from trainer.records import Segment
-from trainer.rollouts import Collector
+from onedemo import envs
+from onedemo.app.cli import main
+from onedemo.baselines import preferences, reward_model
+from onedemo.baselines.comparer import Comparer, ComparisonBudgetSpent, agreement
+from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, draw_pairs, train_preferences
+from onedemo.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
+from onedemo.errors import UserError
+from onedemo.hidden import load_hidden
+from onedemo.motion import backflip_reward
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.records import Segment
+from onedemo.rollouts import Collector
 
 QUICK = RewardConfig(updates=150)
 

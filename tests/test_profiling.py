@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
-from trainer import envs, profiling
-from trainer.physics import load_model
+from onedemo import envs, profiling
+from onedemo.physics import load_model
 
 
 def stepped():

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from trainer.errors import UserError
-from trainer.judge import Judge, RatingBudgetSpent
-from trainer.rater_errors import ERRORS, parse_errors
-from trainer.records import Segment
+from onedemo.errors import UserError
+from onedemo.judge import Judge, RatingBudgetSpent
+from onedemo.rater_errors import ERRORS, parse_errors
+from onedemo.records import Segment
 
 N = 2000
 THRESHOLDS = (1.0, 2.0, 3.0, 4.0)  # classes one wide: 0.5 is the middle of class 5, 2.5 of class 3

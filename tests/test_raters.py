@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from trainer.envs import observe, spec
-from trainer.errors import UserError
-from trainer.headless import train
-from trainer.hidden import HiddenStates
-from trainer.raters import Oracle, RatingBudgetSpent, appearance, make_rater
-from trainer.records import Demo, Segment
-from trainer.store import Store
+from onedemo.envs import observe, spec
+from onedemo.errors import UserError
+from onedemo.headless import train
+from onedemo.hidden import HiddenStates
+from onedemo.raters import Oracle, RatingBudgetSpent, appearance, make_rater
+from onedemo.records import Demo, Segment
+from onedemo.store import Store
 
 
 def states(steps=100, spin=-0.03):

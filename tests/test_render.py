@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from trainer.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
-from trainer.render import HEIGHT, WIDTH, Renderer, RenderThread
-from trainer.timing import frame_of_step, steps_of_frames
+from onedemo.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
+from onedemo.render import HEIGHT, WIDTH, Renderer, RenderThread
+from onedemo.timing import frame_of_step, steps_of_frames
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
 REPO = Path(__file__).resolve().parent.parent
@@ -241,9 +241,9 @@ def test_close_ends_the_job_in_hand_and_cancels_the_rest():
 # --- machines that cannot draw --------------------------------------------------------------------
 
 _DRAW = """
-import trainer.envs, mujoco
-from trainer.errors import UserError
-from trainer.render import Renderer, RenderThread
+import onedemo.envs, mujoco
+from onedemo.errors import UserError
+from onedemo.render import Renderer, RenderThread
 mujoco.MjModel.from_xml_string("<mujoco/>")
 for make in (Renderer, RenderThread):
     try:

@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from test_page import DESKTOP, GUARD_MS, PHONE, opened, until
 
-from app.cli import main
-from app.columns import SKIPS
-from trainer.answers import SKIP_COLUMNS
+from onedemo.answers import SKIP_COLUMNS
+from onedemo.app.cli import main
+from onedemo.app.columns import SKIPS
 
 pytestmark = pytest.mark.seam
 

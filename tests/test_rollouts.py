@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from trainer import envs
-from trainer.errors import UserError
-from trainer.policy import Policy, PolicyConfig
-from trainer.rollouts import Collector, EpisodeRules, Starts, evaluate
+from onedemo import envs
+from onedemo.errors import UserError
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.rollouts import Collector, EpisodeRules, Starts, evaluate
 
 HORIZON = 40
 

@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 
-from trainer.config import load_config
-from trainer.errors import UserError
-from trainer.records import Demo
-from trainer.runs import add_run, find_run
-from trainer.store import Store
+from onedemo.config import load_config
+from onedemo.errors import UserError
+from onedemo.records import Demo
+from onedemo.runs import add_run, find_run
+from onedemo.store import Store
 
 DEMO = Demo(name="flip", sha256="aa", path=Path("flip.webm"), fps=30.0, frames=60, width=8, height=8)
 

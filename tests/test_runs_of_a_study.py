@@ -5,17 +5,17 @@ from contextlib import closing
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from app import study as module
-from app.actions import Actions
-from app.study import Study
-from trainer.asking import Simulated
-from trainer.errors import UserError
-from trainer.files import hold
-from trainer.loop import Trainer
-from trainer.records import Rater
-from trainer.render import RenderThread
-from trainer.runs import add_run
-from trainer.store import Store
+from onedemo.app import study as module
+from onedemo.app.actions import Actions
+from onedemo.app.study import Study
+from onedemo.asking import Simulated
+from onedemo.errors import UserError
+from onedemo.files import hold
+from onedemo.loop import Trainer
+from onedemo.records import Rater
+from onedemo.render import RenderThread
+from onedemo.runs import add_run
+from onedemo.store import Store
 
 pytestmark = pytest.mark.seam
 

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import trainer
-from trainer.demos import import_video
-from trainer.errors import UserError
-from trainer.learner import Learner
-from trainer.motion import CONTACT_MARGIN, clearances
-from trainer.raters import make_rater
-from trainer.records import Demo, Segment
-from trainer.scripted import Script, load_marks, marked, table_path, visible
+import onedemo
+from onedemo.demos import import_video
+from onedemo.errors import UserError
+from onedemo.learner import Learner
+from onedemo.motion import CONTACT_MARGIN, clearances
+from onedemo.raters import make_rater
+from onedemo.records import Demo, Segment
+from onedemo.scripted import Script, load_marks, marked, table_path, visible
 
-TABLE = Path(trainer.__file__).parent / "bench" / "person_backflip.json"
+TABLE = Path(onedemo.__file__).parent / "bench" / "person_backflip.json"
 VIDEO = Path(__file__).parents[2] / "shared" / "videos" / "person_backflip_480.mp4"
 DT, STEPS, W = 0.008, 275, 38
 
@@ -112,7 +112,7 @@ def test_what_is_seen_of_marks_and_robot():
 @pytest.mark.slow
 def test_wild_random_motion_gets_more_than_ones(marks):
     """Statistics of the random policy, printed; a rater of ones alone would teach nothing."""
-    from trainer.config import load_config
+    from onedemo.config import load_config
 
     rollouts = Learner(load_config(None, {}), 66, 30.0).random_rollouts()
     rated = [ratings(marks, qpos, qvel) for qpos, qvel in zip(rollouts.qpos, rollouts.qvel, strict=True)]

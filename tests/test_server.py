@@ -8,7 +8,7 @@ import viser
 from aside import run
 from viser import _messages
 
-from app import assets, server
+from onedemo.app import assets, server
 
 pytestmark = pytest.mark.seam
 

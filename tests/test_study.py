@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.cli import main
-from trainer.bench import study, tables
-from trainer.bench.seeds import band, spread_of
-from trainer.bench.study import Job, Kind, peek, run_jobs
-from trainer.bench.tables import Entry, parse_seeds
-from trainer.errors import UserError
+from onedemo.app.cli import main
+from onedemo.bench import study, tables
+from onedemo.bench.seeds import band, spread_of
+from onedemo.bench.study import Job, Kind, peek, run_jobs
+from onedemo.bench.tables import Entry, parse_seeds
+from onedemo.errors import UserError
 
 
 def job(seed=0, kind="tiny:climb", label="climb", **settings):
@@ -182,7 +182,7 @@ _PARENT = """
 import signal
 import sys
 from pathlib import Path
-from trainer.bench.study import Job, run_jobs
+from onedemo.bench.study import Job, run_jobs
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 at, results = sys.argv[1:]
 jobs = [Job(kind="tiny:waits", label="wait", settings={"at": at}, seed=seed) for seed in (0, 1)]

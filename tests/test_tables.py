@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from trainer.bench import ablation_table, backflip_table, document, ratings_table
-from trainer.bench.method import run_config
-from trainer.bench.study import Job, Outcome, by_label, run_jobs
-from trainer.bench.summary import Goal, figure, median_outcome, table
-from trainer.config import METHODS, load_config
+from onedemo.bench import ablation_table, backflip_table, document, ratings_table
+from onedemo.bench.method import run_config
+from onedemo.bench.study import Job, Outcome, by_label, run_jobs
+from onedemo.bench.summary import Goal, figure, median_outcome, table
+from onedemo.config import METHODS, load_config
 
 TABLES = (backflip_table, ratings_table, ablation_table)
 SEED = 101  # not one of those that are reported

@@ -8,10 +8,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from trainer import migrations
-from trainer.migrations import STEPS, migrate
-from trainer.records import Segment
-from trainer.store import FILE_NAME, NewClip, Store
+from onedemo import migrations
+from onedemo.migrations import STEPS, migrate
+from onedemo.records import Segment
+from onedemo.store import FILE_NAME, NewClip, Store
 
 RUNS = ("first", "second")
 STATES = ("cut", "ready", "withdrawn")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from trainer.records import Segment
-from trainer.segments import pack_segment, unpack_segment
-from trainer.store import NewClip, Store
-from trainer.training_set import TrainingSet
+from onedemo.records import Segment
+from onedemo.segments import pack_segment, unpack_segment
+from onedemo.store import NewClip, Store
+from onedemo.training_set import TrainingSet
 
 
 def segment(value):

@@ -7,19 +7,19 @@ from test_loop import by_rule, make_trainer
 from test_predictor import world
 from worlds import FRAMES, falling_demo, small_config
 
-from app.cli import main
-from trainer import body
-from trainer.appearance import Track
-from trainer.asking import Simulated
-from trainer.errors import UserError
-from trainer.imagined import track_basis
-from trainer.learner import Learner
-from trainer.loop import Trainer
-from trainer.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
-from trainer.records import Segment
-from trainer.runs import add_run
-from trainer.store import RatedSegment, Store
-from trainer.transfer import newest_snapshot
+from onedemo import body
+from onedemo.app.cli import main
+from onedemo.appearance import Track
+from onedemo.asking import Simulated
+from onedemo.errors import UserError
+from onedemo.imagined import track_basis
+from onedemo.learner import Learner
+from onedemo.loop import Trainer
+from onedemo.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
+from onedemo.records import Segment
+from onedemo.runs import add_run
+from onedemo.store import RatedSegment, Store
+from onedemo.transfer import newest_snapshot
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)
 METRIC = PredictorConfig(members=2)

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from test_tables import run
 
-from app.cli import main
-from trainer.bench import document, person, person_table, transfer_table
-from trainer.bench.method import run_config
-from trainer.bench.strip import moments, strip
-from trainer.bench.study import Job, Outcome
-from trainer.bench.transfer_table import BACK, THERE
-from trainer.demos import find_demo
-from trainer.errors import UserError
-from trainer.hidden import hidden_path, load_hidden
-from trainer.motion import farthest_turn, net_turns, turned
+from onedemo.app.cli import main
+from onedemo.bench import document, person, person_table, transfer_table
+from onedemo.bench.method import run_config
+from onedemo.bench.strip import moments, strip
+from onedemo.bench.study import Job, Outcome
+from onedemo.bench.transfer_table import BACK, THERE
+from onedemo.demos import find_demo
+from onedemo.errors import UserError
+from onedemo.hidden import hidden_path, load_hidden
+from onedemo.motion import farthest_turn, net_turns, turned
 
 SEED = 101  # not one of those that are reported
 

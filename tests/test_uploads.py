@@ -9,13 +9,13 @@ from aiohttp import web
 from aside import run
 from test_demos import make_video
 
-from app import uploads
-from app.door import Door, Route
-from app.links import issue_link, read_secret
-from app.listening import Listening
-from app.uploads import Uploads
-from trainer.demos import find_demo, read_frames
-from trainer.store import Store
+from onedemo.app import uploads
+from onedemo.app.door import Door, Route
+from onedemo.app.links import issue_link, read_secret
+from onedemo.app.listening import Listening
+from onedemo.app.uploads import Uploads
+from onedemo.demos import find_demo, read_frames
+from onedemo.store import Store
 
 pytestmark = pytest.mark.seam
 

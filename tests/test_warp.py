@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from trainer import envs
-from trainer.bench.figures import Skipped
-from trainer.config import load_config
-from trainer.errors import UserError
-from trainer.learner import Learner
-from trainer.physics import RolloutPhysics, load_model
-from trainer.policy import Policy, PolicyConfig
-from trainer.rollouts import Collector
-from trainer.trpo import Trpo, TrpoConfig
+from onedemo import envs
+from onedemo.bench.figures import Skipped
+from onedemo.config import load_config
+from onedemo.errors import UserError
+from onedemo.learner import Learner
+from onedemo.physics import RolloutPhysics, load_model
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.rollouts import Collector
+from onedemo.trpo import Trpo, TrpoConfig
 
 pytest.importorskip("mujoco_warp", reason="the extra 'warp' is not installed: pip install 'onedemo[warp]'")
 
@@ -195,7 +195,7 @@ def test_a_run_can_be_set_to_it():
 
 @pytest.mark.parametrize("room", [(1, 41), (14, 12)])
 def test_contacts_without_room_are_an_error(room, monkeypatch):
-    from trainer import warp
+    from onedemo import warp
 
     lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
     model = load_model(envs.SPECS["hopper"].xml)
@@ -207,7 +207,7 @@ def test_contacts_without_room_are_an_error(room, monkeypatch):
 
 
 def test_an_unknown_device_names_those_there_are():
-    from trainer.warp import WarpPhysics
+    from onedemo.warp import WarpPhysics
 
     with pytest.raises(UserError, match=r"no device 'cuda:7' .* there are: cpu"):
         WarpPhysics(load_model(envs.SPECS["hopper"].xml), 4, 1, device="cuda:7")
@@ -215,7 +215,7 @@ def test_an_unknown_device_names_those_there_are():
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    monkeypatch.delitem(sys.modules, "trainer.warp", raising=False)
+    monkeypatch.delitem(sys.modules, "onedemo.warp", raising=False)
     with pytest.raises(UserError, match=r"pip install 'onedemo\[warp\]'"):
         make(2)
 
@@ -226,7 +226,7 @@ def test_an_unknown_physics_is_refused():
 
 
 def test_the_bench_counts_steps_of_both():
-    from trainer.bench.warp import growth, measure
+    from onedemo.bench.warp import growth, measure
 
     taken = growth((2, 8), device="cpu", turns=1, lane_steps=64)
     assert set(taken.y) == {"mujoco", "warp"}

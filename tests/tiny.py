@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.bench.blocks import Chart, Document, Table, Text
-from trainer.bench.seeds import band, spread
-from trainer.bench.study import Job, by_label
+from onedemo.bench.blocks import Chart, Document, Table, Text
+from onedemo.bench.seeds import band, spread
+from onedemo.bench.study import Job, by_label
 
 TITLE = "onedemo: a tiny table"
 SEEDS = 3

@@ -10,14 +10,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from trainer import body, envs
-from trainer.appearance import Track
-from trainer.config import load_config
-from trainer.hidden import HiddenStates, hidden_path, save_hidden
-from trainer.motion import joint_points
-from trainer.records import Demo
-from trainer.render import Renderer
-from trainer.video import write_webm
+from onedemo import body, envs
+from onedemo.appearance import Track
+from onedemo.config import load_config
+from onedemo.hidden import HiddenStates, hidden_path, save_hidden
+from onedemo.motion import joint_points
+from onedemo.records import Demo
+from onedemo.render import Renderer
+from onedemo.video import write_webm
 
 STEPS = 250
 FRAMES = 60

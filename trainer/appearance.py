@@ -22,11 +22,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from trainer import body, envs
-from trainer.encoders import Encoder
-from trainer.files import read_whole, write_atomic
-from trainer.render import RenderThread
-from trainer.starts import wild_rollouts
+from onedemo import body, envs
+from onedemo.encoders import Encoder
+from onedemo.files import read_whole, write_atomic
+from onedemo.render import RenderThread
+from onedemo.starts import wild_rollouts
 
 PICTURES = 4000
 _SEED = 20_000

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trainer.clipmaker import ClipMaker
-from trainer.config import RunConfig
-from trainer.errors import UserError
-from trainer.learner import Learner
-from trainer.predictor import Snapshot
-from trainer.records import Clip, Rollouts, Segment
-from trainer.store import NewClip, Store
+from onedemo.clipmaker import ClipMaker
+from onedemo.config import RunConfig
+from onedemo.errors import UserError
+from onedemo.learner import Learner
+from onedemo.predictor import Snapshot
+from onedemo.records import Clip, Rollouts, Segment
+from onedemo.store import NewClip, Store
 
 _FULL = 2 / 3
 """Share of the queue that waits before it is filled up for people."""

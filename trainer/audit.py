@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from trainer.database import Database, now
+from onedemo.database import Database, now
 
 AUDIT_COLUMNS = ("at", "who", "what", "detail")
 _LONGEST = 500

@@ -22,9 +22,9 @@ from importlib.metadata import version
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-from trainer.errors import UserError
-from trainer.migrations import check_version
-from trainer.store import FILE_NAME
+from onedemo.errors import UserError
+from onedemo.migrations import check_version
+from onedemo.store import FILE_NAME
 
 MANIFEST = "manifest.json"
 FORMAT = 1

@@ -17,8 +17,8 @@ from typing import Any
 
 import torch
 
-from trainer.files import read_whole, write_atomic
-from trainer.records import Rollouts
+from onedemo.files import read_whole, write_atomic
+from onedemo.records import Rollouts
 
 _UNSEEN = ("inputs", "next_inputs")
 """What no clip is cut from, the larger part: left out."""

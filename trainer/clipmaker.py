@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.clips import compose_clip
-from trainer.errors import in_words
-from trainer.files import jpeg_fault, read_whole, sealed, write_atomic
-from trainer.records import Clip
-from trainer.render import Renderer, RenderThread
-from trainer.store import Store
+from onedemo.clips import compose_clip
+from onedemo.errors import in_words
+from onedemo.files import jpeg_fault, read_whole, sealed, write_atomic
+from onedemo.records import Clip
+from onedemo.render import Renderer, RenderThread
+from onedemo.store import Store
 
 log = logging.getLogger("onedemo")
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from trainer.choice import CHOICES
-from trainer.errors import UserError
-from trainer.policy import PolicyConfig
-from trainer.practice import PracticeConfig
-from trainer.predictor import PredictorConfig
-from trainer.trpo import TrpoConfig
+from onedemo.choice import CHOICES
+from onedemo.errors import UserError
+from onedemo.policy import PolicyConfig
+from onedemo.practice import PracticeConfig
+from onedemo.predictor import PredictorConfig
+from onedemo.trpo import TrpoConfig
 
 T = TypeVar("T")
 

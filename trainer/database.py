@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from trainer.errors import UserError
-from trainer.migrations import check_version, migrate
+from onedemo.errors import UserError
+from onedemo.migrations import check_version, migrate
 
 FILE_NAME = "onedemo.sqlite3"
 

@@ -23,16 +23,17 @@ from typing import Any
 
 import numpy as np
 
-from trainer.demo_checks import check_options
-from trainer.errors import UserError
-from trainer.files import write_atomic
-from trainer.guarded import Limits, Options, decode
-from trainer.names import check_name
-from trainer.records import Demo
-from trainer.timing import steps_of_frames
-from trainer.video import VideoReader, write_webm
+from onedemo import static
+from onedemo.demo_checks import check_options
+from onedemo.errors import UserError
+from onedemo.files import write_atomic
+from onedemo.guarded import Limits, Options, decode
+from onedemo.names import check_name
+from onedemo.records import Demo
+from onedemo.timing import steps_of_frames
+from onedemo.video import VideoReader, write_webm
 
-BUILT_IN = Path(__file__).resolve().parent.parent / "static" / "demos"
+BUILT_IN = Path(static.__file__).parent / "demos"
 
 _log = logging.getLogger(__name__)
 
@@ -158,7 +159,7 @@ def render_demo(
     Raises:
         UserError: If the name is not allowed or this machine cannot draw.
     """
-    from trainer.render import Renderer  # here: listing demos needs no GL
+    from onedemo.render import Renderer
 
     check_name(name)
     count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)

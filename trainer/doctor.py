@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
-from trainer.demos import list_demos
-from trainer.encoders import make_encoder
-from trainer.errors import UserError
-from trainer.files import archive_fault, jpeg_fault
-from trainer.migrations import STEPS, check_version
-from trainer.render import HEIGHT, WIDTH, RenderThread
-from trainer.store import FILE_NAME
-from trainer.transfer import snapshot_file
+from onedemo.demos import list_demos
+from onedemo.encoders import make_encoder
+from onedemo.errors import UserError
+from onedemo.files import archive_fault, jpeg_fault
+from onedemo.migrations import STEPS, check_version
+from onedemo.render import HEIGHT, WIDTH, RenderThread
+from onedemo.store import FILE_NAME
+from onedemo.transfer import snapshot_file
 
 _LITTLE_ROOM = 1 << 30
 _NAMED = 3

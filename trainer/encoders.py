@@ -24,11 +24,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from trainer.demos import stream_frames
-from trainer.errors import UserError
-from trainer.files import read_whole, write_atomic
-from trainer.folded import BATCH, SIDE, Folded
-from trainer.records import Demo
+from onedemo.demos import stream_frames
+from onedemo.errors import UserError
+from onedemo.files import read_whole, write_atomic
+from onedemo.folded import BATCH, SIDE, Folded
+from onedemo.records import Demo
 
 VGG16_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"
 """ImageNet weights as published by torchvision (528 MB); the name ends in the file's SHA-256."""

@@ -1,6 +1,6 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
-Evaluation may read hidden demo states; nothing in ``trainer.learner`` or ``trainer.loop`` may.
+Evaluation may read hidden demo states; nothing in ``onedemo.learner`` or ``onedemo.loop`` may.
 
 Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainer import envs
-from trainer.alignment import align
-from trainer.learner import Learner
-from trainer.motion import (
+from onedemo import envs
+from onedemo.alignment import align
+from onedemo.learner import Learner
+from onedemo.motion import (
     backflip_reward,
     clean_turns,
     farthest_turn,
@@ -22,10 +22,10 @@ from trainer.motion import (
     turned,
     until_fall,
 )
-from trainer.policy import PolicySnapshot
-from trainer.predictor import Snapshot
-from trainer.raters import Oracle, appearance
-from trainer.rollouts import EpisodeRules, Episodes, evaluate
+from onedemo.policy import PolicySnapshot
+from onedemo.predictor import Snapshot
+from onedemo.raters import Oracle, appearance
+from onedemo.rollouts import EpisodeRules, Episodes, evaluate
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6
@@ -97,8 +97,8 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``state_error``: mean squared error of its states (``state_errors``), mean over time.
         - ``backflip_reward``, with the actions clipped to what the motors do, and
           ``backflip_reward_raw_actions``.
-        - ``net_turns``, ``clean_turns``, ``landings``: see ``trainer.motion``.
-        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``trainer.motion``.
+        - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.motion``.
+        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``onedemo.motion``.
         - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
         - ``hop_reward``: the same rewards over the whole episode, falls or not.
         - ``upright_seconds``: until then.
@@ -142,7 +142,7 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     """How like the demo episodes are if being early or late does not count, up to ``ALIGN_SECONDS``.
 
     Each episode is laid along the demo by dynamic time warping on the oracle's distance
-    (``trainer.alignment``); then every moment of the demo is rated against the episode's moment beside it.
+    (``onedemo.alignment``); then every moment of the demo is rated against the episode's moment beside it.
 
     Args:
         qpos: Positions, (N, T, q).

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 log = logging.getLogger("onedemo")
 

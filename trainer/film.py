@@ -1,4 +1,4 @@
-"""Films the built-in demos anew: ``python -m trainer.film hopper-hop --task hop --source "..."``.
+"""Films the built-in demos anew: ``python -m onedemo.film hopper-hop --task hop --source "..."``.
 
 This is the maker of a simulated demo, so it may look at the states behind it; nothing that learns
 imports this module.
@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from trainer.demos import BUILT_IN, render_demo, show
-from trainer.hidden import SUFFIX, load_hidden
+from onedemo.demos import BUILT_IN, render_demo, show
+from onedemo.hidden import SUFFIX, load_hidden
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Reads ``<out>/<name>.hidden.npz``, writes the video and its description beside it."""
-    parser = argparse.ArgumentParser(prog="python -m trainer.film", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m onedemo.film", description=main.__doc__)
     parser.add_argument("name", help="the demo's name")
     parser.add_argument("--task", required=True, help="the hand-coded reward that describes it")
     parser.add_argument("--source", required=True, help="what made the motion")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from trainer.policy import Policy
+from onedemo.policy import Policy
 
 
 def conjugate_gradient(

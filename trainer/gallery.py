@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from trainer.clips import side_by_side
-from trainer.demos import read_frames
-from trainer.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
-from trainer.predictor import Snapshot
-from trainer.records import Demo, Rollouts
-from trainer.render import Renderer, RenderThread
-from trainer.video import write_webm
+from onedemo.clips import side_by_side
+from onedemo.demos import read_frames
+from onedemo.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
+from onedemo.predictor import Snapshot
+from onedemo.records import Demo, Rollouts
+from onedemo.render import Renderer, RenderThread
+from onedemo.video import write_webm
 
 PARTS = 40
 """Of the demo, each with a mean rating."""

@@ -12,7 +12,7 @@ import os
 import sys
 from typing import Any
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 _OFF = ("disable", "disabled", "off", "false", "0")
 

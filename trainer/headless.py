@@ -10,19 +10,19 @@ from typing import Any
 
 from tqdm import tqdm
 
-from trainer.asking import Simulated
-from trainer.config import RunConfig
-from trainer.encoders import Encoder
-from trainer.evaluation import summarise
-from trainer.files import hold
-from trainer.hidden import hidden_path, load_hidden
-from trainer.learner import Learner
-from trainer.loop import Trainer
-from trainer.predictor import Snapshot
-from trainer.raters import Oracle, make_rater, marker
-from trainer.records import Demo
-from trainer.runs import add_run, find_run, program_version
-from trainer.store import Store
+from onedemo.asking import Simulated
+from onedemo.config import RunConfig
+from onedemo.encoders import Encoder
+from onedemo.evaluation import summarise
+from onedemo.files import hold
+from onedemo.hidden import hidden_path, load_hidden
+from onedemo.learner import Learner
+from onedemo.loop import Trainer
+from onedemo.predictor import Snapshot
+from onedemo.raters import Oracle, make_rater, marker
+from onedemo.records import Demo
+from onedemo.runs import add_run, find_run, program_version
+from onedemo.store import Store
 
 
 def train(
@@ -47,12 +47,12 @@ def train(
         demo: What is to be learned; the oracle needs its hidden states.
         config: ``ratings.pretrain + ratings.online`` is the rater's budget.
         encoder: Looks at the demo's frames.
-        rater: Name of the simulated rater, see ``trainer.raters.make_rater``.
+        rater: Name of the simulated rater, see ``onedemo.raters.make_rater``.
         name: Of the run; an unfinished run of that name goes on.
         progress: Show a progress bar on standard error.
         cache_dir: Holds what is known of demos and robots; the data directory if None.
         watch: Called with learner and snapshot after each iteration, for a learning curve.
-        start: Snapshot of another run that the predictor starts from, see ``trainer.transfer``.
+        start: Snapshot of another run that the predictor starts from, see ``onedemo.transfer``.
 
     Returns:
         The summary, ready for JSON: ratings, figures over 16 episodes of the final policy, costs.

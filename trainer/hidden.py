@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 SUFFIX = ".hidden.npz"
 _FIELDS = ("obs", "actions", "qpos", "qvel")

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from trainer import body
-from trainer.predictor import visual_inputs
+from onedemo import body
+from onedemo.predictor import visual_inputs
 
 _DIMS = 8
 """Principal components of the frame features that say how alike two frames look."""

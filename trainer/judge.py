@@ -1,6 +1,6 @@
 """The rater that measures: a distance at each step of a clip, four thresholds, a budget.
 
-``trainer.raters.Oracle`` and ``trainer.scripted.Script`` say what is measured; ``trainer.rater_errors``
+``onedemo.raters.Oracle`` and ``onedemo.scripted.Script`` say what is measured; ``onedemo.rater_errors``
 what goes wrong on the way to a rating. Nothing that learns may import this module.
 
 Shapes: W control steps, q = v = 6.
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.rater_errors import Errors, Look
-from trainer.records import Segment
+from onedemo.rater_errors import Errors, Look
+from onedemo.records import Segment
 
 _STREAM = 1511
 """Sets a rater's random numbers apart from others that the same seed gives."""

@@ -14,21 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from trainer import body, envs
-from trainer.appearance import Track
-from trainer.choice import Question, choose
-from trainer.config import RunConfig
-from trainer.errors import UserError
-from trainer.imagined import track_basis
-from trainer.policy import Policy, PolicySnapshot, check_device
-from trainer.practice import PracticeRules, fill_bank
-from trainer.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
-from trainer.records import Rollouts, Segment
-from trainer.rollouts import Collector, EpisodeRules, Transitions
-from trainer.starts import wild_rollouts
-from trainer.store import RatedSegment
-from trainer.timing import frame_of_step
-from trainer.trpo import Trpo
+from onedemo import body, envs
+from onedemo.appearance import Track
+from onedemo.choice import Question, choose
+from onedemo.config import RunConfig
+from onedemo.errors import UserError
+from onedemo.imagined import track_basis
+from onedemo.policy import Policy, PolicySnapshot, check_device
+from onedemo.practice import PracticeRules, fill_bank
+from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
+from onedemo.records import Rollouts, Segment
+from onedemo.rollouts import Collector, EpisodeRules, Transitions
+from onedemo.starts import wild_rollouts
+from onedemo.store import RatedSegment
+from onedemo.timing import frame_of_step
+from onedemo.trpo import Trpo
 
 _RANDOM_LANES = 16
 _WILD_LANES = 64

@@ -19,29 +19,29 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from trainer import envs, gallery
-from trainer.appearance import Track
-from trainer.appearance import learn as learn_appearance
-from trainer.asking import Asking, Simulated
-from trainer.checkpoint import load_checkpoint, save_checkpoint
-from trainer.clipmaker import ClipMaker
-from trainer.config import RunConfig
-from trainer.demos import read_frames
-from trainer.encoders import Encoder, demo_features
-from trainer.errors import in_words
-from trainer.files import read_whole
-from trainer.learner import Learner
-from trainer.motion import TASK_REWARDS
-from trainer.pairing import Pairing
-from trainer.policy import PolicySnapshot
-from trainer.predictor import Snapshot
-from trainer.priority import give_way
-from trainer.records import Demo, Rollouts, Status
-from trainer.render import RenderThread
-from trainer.rollouts import Acting, EpisodeRules, Transitions
-from trainer.store import Store
-from trainer.training_set import TrainingSet
-from trainer.transfer import keep_start, snapshot_file
+from onedemo import envs, gallery
+from onedemo.appearance import Track
+from onedemo.appearance import learn as learn_appearance
+from onedemo.asking import Asking, Simulated
+from onedemo.checkpoint import load_checkpoint, save_checkpoint
+from onedemo.clipmaker import ClipMaker
+from onedemo.config import RunConfig
+from onedemo.demos import read_frames
+from onedemo.encoders import Encoder, demo_features
+from onedemo.errors import in_words
+from onedemo.files import read_whole
+from onedemo.learner import Learner
+from onedemo.motion import TASK_REWARDS
+from onedemo.pairing import Pairing
+from onedemo.policy import PolicySnapshot
+from onedemo.predictor import Snapshot
+from onedemo.priority import give_way
+from onedemo.records import Demo, Rollouts, Status
+from onedemo.render import RenderThread
+from onedemo.rollouts import Acting, EpisodeRules, Transitions
+from onedemo.store import Store
+from onedemo.training_set import TrainingSet
+from onedemo.transfer import keep_start, snapshot_file
 
 log = logging.getLogger("onedemo")
 

@@ -14,9 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from trainer.records import Segment
-from trainer.store import RatedSegment
-from trainer.timing import frame_of_step
+from onedemo.records import Segment
+from onedemo.store import RatedSegment
+from onedemo.timing import frame_of_step
 
 INSIDE, OUTSIDE = 0, 1
 """Points that the marked steps and the others differ from the rating of their clip."""

@@ -29,11 +29,11 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from trainer import body
-from trainer.imagined import track_of
-from trainer.marks import marked_steps
-from trainer.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
-from trainer.store import RatedSegment
+from onedemo import body
+from onedemo.imagined import track_of
+from onedemo.marks import marked_steps
+from onedemo.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from onedemo.store import RatedSegment
 
 _UPDATES = 300
 _RATE = 0.03

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from trainer import envs
+from onedemo import envs
 
 CONTACT_MARGIN = 0.002
 """Metres between a part and the ground at which MuJoCo's contact sets in: a part can lie on the

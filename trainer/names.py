@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _IN_PEOPLE = frozenset(" -_.'@,()+&#")

@@ -19,10 +19,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from trainer.errors import UserError
-from trainer.marks import split_marks
-from trainer.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
-from trainer.store import RatedSegment
+from onedemo.errors import UserError
+from onedemo.marks import split_marks
+from onedemo.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
+from onedemo.store import RatedSegment
 
 STANDARD_DIMS = 15
 _JUDGED_CLIPS = 2000

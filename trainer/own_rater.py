@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from trainer import envs
-from trainer.clips import fit
-from trainer.demos import read_frames
-from trainer.errors import UserError
-from trainer.judge import Budget
-from trainer.records import Demo, Segment
-from trainer.timing import frame_of_step
+from onedemo import envs
+from onedemo.clips import fit
+from onedemo.demos import read_frames
+from onedemo.errors import UserError
+from onedemo.judge import Budget
+from onedemo.records import Demo, Segment
+from onedemo.timing import frame_of_step
 
 
 class OwnRater(Budget):
@@ -88,8 +88,8 @@ class OwnRater(Budget):
             self._renderer = None
 
     def _clips(self, segment: Segment, demo_step: int) -> tuple[np.ndarray, np.ndarray]:
-        """The pictures of ``trainer.clipmaker``: one of the robot for each frame of the demo's clip."""
-        from trainer.render import RenderThread  # here: other raters need no GL
+        """The pictures of ``onedemo.clipmaker``: one of the robot for each frame of the demo's clip."""
+        from onedemo.render import RenderThread
 
         if self._frames is None:
             self._frames = read_frames(self._demo)

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.choice import choose
-from trainer.clips import compose_clip
-from trainer.files import jpeg_fault, read_whole, sealed, write_atomic
-from trainer.learner import Learner
-from trainer.pairs import NewPair, Pair
-from trainer.records import Rollouts
-from trainer.render import Renderer, RenderThread
-from trainer.store import Store
+from onedemo.choice import choose
+from onedemo.clips import compose_clip
+from onedemo.files import jpeg_fault, read_whole, sealed, write_atomic
+from onedemo.learner import Learner
+from onedemo.pairs import NewPair, Pair
+from onedemo.records import Rollouts
+from onedemo.render import Renderer, RenderThread
+from onedemo.store import Store
 
 log = logging.getLogger("onedemo")
 

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from trainer import profiling
+from onedemo import profiling
 
 profiling.switch_off()
 
@@ -101,7 +101,7 @@ def make_physics(kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: in
     if kind == "mujoco":
         return RolloutPhysics(model, frame_skip, num_envs, nthread)
     if kind == "warp":
-        from trainer.warp import WarpPhysics  # an optional extra, slow to import
+        from onedemo.warp import WarpPhysics
 
         return WarpPhysics(model, frame_skip, num_envs)
     raise ValueError(f"physics must be 'mujoco' or 'warp', got {kind!r}")

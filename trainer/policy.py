@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from trainer.errors import UserError
-from trainer.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
+from onedemo.errors import UserError
+from onedemo.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
 
 _CLIP = 10.0
 """Normalised inputs are clipped to +- this many standard deviations."""

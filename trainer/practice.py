@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from trainer.predictor import CLASSES, Snapshot
-from trainer.rollouts import EpisodeRules, Rollouts, Starts, Step
+from onedemo.predictor import CLASSES, Snapshot
+from onedemo.rollouts import EpisodeRules, Rollouts, Starts, Step
 
 _MOVES = np.arange(4)
 _MOVE_COST = 0.02

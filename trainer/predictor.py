@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from trainer.appearance import Track
-from trainer.errors import UserError
-from trainer.files import archive_fault, write_atomic
-from trainer.store import RatedSegment
+from onedemo.appearance import Track
+from onedemo.errors import UserError
+from onedemo.files import archive_fault, write_atomic
+from onedemo.store import RatedSegment
 
 CLASSES = 5
-KINDS = {"network": "trainer.network", "metric": "trainer.metric"}
+KINDS = {"network": "onedemo.network", "metric": "onedemo.metric"}
 """Kind to module; each has ``fit(...)`` as below and ``restore(data, config, device)``."""
 _FAR = 5.0
 """Standard deviations beyond which a visual input of another demo is no farther."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 CLASSES = np.arange(1, 6)
 BOUNDARIES = (4.5, 3.5, 2.5, 1.5)

@@ -1,9 +1,9 @@
 """Simulated raters, by name. They compare what a person would see; the oracle reads hidden demo states.
 
 ``oracle``, ``script[:TABLE.json]`` or ``package.module:Class``; the first two may be followed by error
-models, ``oracle+mistake:0.1+jitter`` (``trainer.rater_errors``), and by ``+seed:N``.
+models, ``oracle+mistake:0.1+jitter`` (``onedemo.rater_errors``), and by ``+seed:N``.
 
-Nothing that learns may import this module or ``trainer.hidden``: a rater sees the demo's states, the
+Nothing that learns may import this module or ``onedemo.hidden``: a rater sees the demo's states, the
 learner sees nothing but the rating.
 
 Shapes: W control steps, q = v = 6.
@@ -18,13 +18,13 @@ from typing import Protocol
 
 import numpy as np
 
-from trainer.errors import UserError
-from trainer.hidden import HiddenStates
-from trainer.judge import Judge, RatingBudgetSpent
-from trainer.own_rater import OwnRater
-from trainer.rater_errors import Errors, parse_errors
-from trainer.records import Demo, Segment
-from trainer.scripted import Script, load_marks, table_path
+from onedemo.errors import UserError
+from onedemo.hidden import HiddenStates
+from onedemo.judge import Judge, RatingBudgetSpent
+from onedemo.own_rater import OwnRater
+from onedemo.rater_errors import Errors, parse_errors
+from onedemo.records import Demo, Segment
+from onedemo.scripted import Script, load_marks, table_path
 
 __all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appearance", "make_rater"]
 

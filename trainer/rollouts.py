@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from trainer import envs
-from trainer.policy import PolicySnapshot
-from trainer.records import Rollouts
+from onedemo import envs
+from onedemo.policy import PolicySnapshot
+from onedemo.records import Rollouts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -9,13 +9,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from trainer.config import RunConfig, load_config, to_toml
-from trainer.errors import UserError
-from trainer.files import write_atomic
-from trainer.learner import lengths
-from trainer.names import check_name
-from trainer.records import Demo
-from trainer.store import Store
+from onedemo.config import RunConfig, load_config, to_toml
+from onedemo.errors import UserError
+from onedemo.files import write_atomic
+from onedemo.learner import lengths
+from onedemo.names import check_name
+from onedemo.records import Demo
+from onedemo.store import Store
 
 
 def program_version() -> str:

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer import envs
-from trainer.errors import UserError
-from trainer.judge import Judge
-from trainer.motion import CONTACT_MARGIN, clearances
-from trainer.rater_errors import Errors
-from trainer.records import Demo
+from onedemo import envs
+from onedemo.errors import UserError
+from onedemo.judge import Judge
+from onedemo.motion import CONTACT_MARGIN, clearances
+from onedemo.rater_errors import Errors
+from onedemo.records import Demo
 
 SUFFIX = ".script.json"
 THRESHOLDS = (0.6, 0.9, 1.35, 1.9)

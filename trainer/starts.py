@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainer import envs
-from trainer.motion import clearances
-from trainer.rollouts import Collector, EpisodeRules, Starts, Transitions
+from onedemo import envs
+from onedemo.motion import clearances
+from onedemo.rollouts import Collector, EpisodeRules, Starts, Transitions
 
 _JOINTS = np.array([[-2.6, 0.05], [-2.6, 0.05], [-0.78, 0.78]])
 """Range of thigh, leg and foot, radians: that of the model's joints (hopper.xml), whose stops are soft."""

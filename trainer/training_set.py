@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainer.records import Segment
-from trainer.store import RatedSegment, Rating, Store
+from onedemo.records import Segment
+from onedemo.store import RatedSegment, Rating, Store
 
 
 class TrainingSet:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from trainer.errors import UserError
-from trainer.files import archive_fault, write_atomic
-from trainer.store import Store
+from onedemo.errors import UserError
+from onedemo.files import archive_fault, write_atomic
+from onedemo.store import Store
 
 _KEPT = "start.pt"
 

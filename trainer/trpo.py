@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from trainer.fisher import conjugate_gradient, fisher_product, mean_kl
-from trainer.policy import Policy, ValueFunction
-from trainer.records import Rollouts
+from onedemo.fisher import conjugate_gradient, fisher_product, mean_kl
+from onedemo.policy import Policy, ValueFunction
+from onedemo.records import Rollouts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

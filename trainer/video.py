@@ -20,7 +20,7 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 import numpy as np
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 _ASSUMED_FPS = 30.0
 

@@ -29,7 +29,7 @@ contacts in the order in which its threads finish (its option ``deterministic`` 
 import mujoco
 import numpy as np
 
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 try:
     import mujoco_warp

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.migrations import STEPS
-from trainer.records import Segment
-from trainer.segments import pack_segment
+from onedemo.migrations import STEPS
+from onedemo.records import Segment
+from onedemo.segments import pack_segment
 
 HERE = Path(__file__).parent
 AT = "2026-01-02T03:04:05.678Z"

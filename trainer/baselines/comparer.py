@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from trainer.motion import backflip_reward
-from trainer.records import Segment
-from trainer.rollouts import Transitions
+from onedemo.motion import backflip_reward
+from onedemo.records import Segment
+from onedemo.rollouts import Transitions
 
 
 class ComparisonBudgetSpent(Exception):

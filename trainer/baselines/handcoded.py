@@ -1,6 +1,6 @@
 """The paper's first baseline: TRPO on a hand-coded reward. It also makes two of the demos.
 
-``python -m trainer.baselines.handcoded --task backflip --steps 3000000 --seed 2 --out PREFIX``
+``python -m onedemo.baselines.handcoded --task backflip --steps 3000000 --seed 2 --out PREFIX``
 writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
 ``PREFIX.json`` (settings and the learning curve).
 """
@@ -16,15 +16,15 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from trainer import envs
-from trainer.baselines.scores import Score, judge, save_training
-from trainer.errors import UserError
-from trainer.hidden import HiddenStates
-from trainer.motion import TASK_REWARDS
-from trainer.policy import Policy, PolicyConfig, check_device
-from trainer.priority import cores
-from trainer.rollouts import Collector, evaluate
-from trainer.trpo import Trpo, TrpoConfig
+from onedemo import envs
+from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.errors import UserError
+from onedemo.hidden import HiddenStates
+from onedemo.motion import TASK_REWARDS
+from onedemo.policy import Policy, PolicyConfig, check_device
+from onedemo.priority import cores
+from onedemo.rollouts import Collector, evaluate
+from onedemo.trpo import Trpo, TrpoConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -23,9 +23,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from trainer import envs
-from trainer.baselines.comparer import Comparer, agreement
-from trainer.baselines.reward_model import (
+from onedemo import envs
+from onedemo.baselines.comparer import Comparer, agreement
+from onedemo.baselines.reward_model import (
     Comparison,
     Pair,
     RewardConfig,
@@ -34,16 +34,16 @@ from trainer.baselines.reward_model import (
     fit_reward,
     most_disputed,
 )
-from trainer.baselines.scores import Score, judge, save_training
-from trainer.config import split_ratings
-from trainer.errors import UserError
-from trainer.hidden import HiddenStates
-from trainer.pairs import COMPARISON_COLUMNS
-from trainer.policy import Policy, PolicyConfig
-from trainer.priority import cores
-from trainer.rollouts import Collector, Transitions, evaluate
-from trainer.store import Store
-from trainer.trpo import Trpo, TrpoConfig
+from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.config import split_ratings
+from onedemo.errors import UserError
+from onedemo.hidden import HiddenStates
+from onedemo.pairs import COMPARISON_COLUMNS
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.priority import cores
+from onedemo.rollouts import Collector, Transitions, evaluate
+from onedemo.store import Store
+from onedemo.trpo import Trpo, TrpoConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

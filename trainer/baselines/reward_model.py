@@ -19,8 +19,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from trainer.network import STANDARD_DIMS, standard_inputs
-from trainer.records import Segment
+from onedemo.network import STANDARD_DIMS, standard_inputs
+from onedemo.records import Segment
 
 Pair = tuple[Segment, Segment]
 

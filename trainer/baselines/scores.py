@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from trainer import envs
-from trainer.hidden import SUFFIX, HiddenStates, save_hidden
-from trainer.motion import clean_turns, net_turns, task_reward, until_fall
-from trainer.policy import Policy
-from trainer.rollouts import Episodes
+from onedemo import envs
+from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
+from onedemo.motion import clean_turns, net_turns, task_reward, until_fall
+from onedemo.policy import Policy
+from onedemo.rollouts import Episodes
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,6 @@
 """Standing backflips with landings, by trajectory optimisation. It makes one of the demos.
 
-``python -m trainer.baselines.trajopt --flips 3 --seed 0 --out PREFIX`` writes
+``python -m onedemo.baselines.trajopt --flips 3 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
 1999) searches the next second of motor commands for those that best keep a timetable of leaps, and
 the first part of the best plan is carried out. Touching the ground with anything but the foot
@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from trainer import envs
-from trainer.errors import UserError
-from trainer.hidden import SUFFIX, HiddenStates, save_hidden
-from trainer.motion import backflip_reward, clean_turns, clearances, fallen, joint_points, net_turns
+from onedemo import envs
+from onedemo.errors import UserError
+from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
+from onedemo.motion import backflip_reward, clean_turns, clearances, fallen, joint_points, net_turns
 
 GRAVITY = 9.81
 STANDING = 1.2

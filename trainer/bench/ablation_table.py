@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from trainer.bench import backflip_table
-from trainer.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
-from trainer.bench.method import method_job
-from trainer.bench.seeds import spread
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.bench.summary import Groups, figure
-from trainer.config import METHODS, RunConfig
+from onedemo.bench import backflip_table
+from onedemo.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
+from onedemo.bench.method import method_job
+from onedemo.bench.seeds import spread
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.bench.summary import Groups, figure
+from onedemo.config import METHODS, RunConfig
 
 TITLE = "onedemo: what each part contributes"
 SEEDS = 3

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from trainer.bench.blocks import Block, Document, Heading, Table, Text, number
-from trainer.bench.document import about
-from trainer.bench.study import Outcome, by_label, kind_of
-from trainer.bench.tables import TUNING_FROM
+from onedemo.bench.blocks import Block, Document, Heading, Table, Text, number
+from onedemo.bench.document import about
+from onedemo.bench.study import Outcome, by_label, kind_of
+from onedemo.bench.tables import TUNING_FROM
 
 _IN_ITS_FILE = ("curve", "errors", "episode")
 """What a result may hold that is too long for a report's figures."""

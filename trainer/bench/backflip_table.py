@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.bench.blocks import Block, Document, Heading, Text
-from trainer.bench.method import method_job, whole_config
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.bench.summary import (
+from onedemo.bench.blocks import Block, Document, Heading, Text
+from onedemo.bench.method import method_job, whole_config
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.bench.summary import (
     Goal,
     Groups,
     Result,

@@ -1,6 +1,6 @@
 """What the method is compared with: rewards that somebody wrote, comparisons, and the true rating.
 
-Each gives the same kind of result as ``trainer.bench.method``. Settings: ``demo``, which the episodes are
+Each gives the same kind of result as ``onedemo.bench.method``. Settings: ``demo``, which the episodes are
 compared with, and ``steps`` of practice, and those named below.
 """
 
@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from trainer import body, envs
-from trainer.appearance import Track
-from trainer.baselines.handcoded import HandcodedConfig, train_handcoded
-from trainer.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
-from trainer.baselines.scores import Score
-from trainer.bench.method import POINTS, Watch, hidden_of, oracle_of, outcome
-from trainer.config import load_config
-from trainer.demos import find_demo
-from trainer.errors import UserError
-from trainer.evaluation import per_episode, perform_policy
-from trainer.hidden import HiddenStates
-from trainer.learner import Learner
-from trainer.policy import Policy
-from trainer.predictor import CLASSES, PredictorConfig, Snapshot
-from trainer.raters import Oracle, appearance
-from trainer.records import Demo
-from trainer.timing import steps_of_frames
-from trainer.trpo import TrpoConfig
+from onedemo import body, envs
+from onedemo.appearance import Track
+from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
+from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
+from onedemo.baselines.scores import Score
+from onedemo.bench.method import POINTS, Watch, hidden_of, oracle_of, outcome
+from onedemo.config import load_config
+from onedemo.demos import find_demo
+from onedemo.errors import UserError
+from onedemo.evaluation import per_episode, perform_policy
+from onedemo.hidden import HiddenStates
+from onedemo.learner import Learner
+from onedemo.policy import Policy
+from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
+from onedemo.raters import Oracle, appearance
+from onedemo.records import Demo
+from onedemo.timing import steps_of_frames
+from onedemo.trpo import TrpoConfig
 
 _TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}
 """Those that made the built-in demos."""
@@ -86,7 +86,7 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
 
     Args:
         settings: And ``method``: "paper" practises by a fixed clock from standing starts, "onedemo" with
-            an elastic clock, a bank of starts and giving up; and ``set``, as in ``trainer.bench.method``.
+            an elastic clock, a bank of starts and giving up; and ``set``, as in ``onedemo.bench.method``.
         seed: Of everything random.
         scratch: Not used.
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.bench.figures import Result, Skipped, single
-from trainer.bench.serving import Stocked, bring, stocked
+from onedemo.bench.figures import Result, Skipped, single
+from onedemo.bench.serving import Stocked, bring, stocked
 
 PEOPLE = 50
 EVERY_S = 4.0

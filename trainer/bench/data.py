@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.bench.figures import Growth, Result, single
-from trainer.records import Segment
-from trainer.segments import pack_segment
-from trainer.store import Store
-from trainer.training_set import TrainingSet
+from onedemo.bench.figures import Growth, Result, single
+from onedemo.records import Segment
+from onedemo.segments import pack_segment
+from onedemo.store import Store
+from onedemo.training_set import TrainingSet
 
 _RUN = "bench"
 _RATERS, _ITERATIONS, _WAITING = 50, 500, 20
@@ -173,7 +173,7 @@ def _press(store: Store) -> None:
 
 def _export(directory: Path) -> tuple[float, float]:
     """Runs the command; seconds to its first rows, and the most memory it had, MiB."""
-    command = [sys.executable, "-m", "app.cli", "export", "--data-dir", str(directory)]
+    command = [sys.executable, "-m", "onedemo.app.cli", "export", "--data-dir", str(directory)]
     began = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from trainer.bench.blocks import (
+from onedemo.bench.blocks import (
     Bars,
     Bullets,
     Cell,
@@ -24,10 +24,10 @@ from trainer.bench.blocks import (
     file_name,
     numeric_columns,
     shown,
-)  # fmt: skip
-from trainer.bench.machine import machine, now, program
-from trainer.bench.page import as_html
-from trainer.files import write_atomic
+)
+from onedemo.bench.machine import machine, now, program
+from onedemo.bench.page import as_html
+from onedemo.files import write_atomic
 
 
 def about(*, command: str, seconds: float | None = None, **more: Any) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def write(document: Document, out: Path) -> None:
         if isinstance(block, Picture):
             write_atomic(out / block.name, block.data)
         elif isinstance(block, Chart | Bars):
-            from trainer.bench.drawing import draw
+            from onedemo.bench.drawing import draw
 
             write_atomic(out / file_name(block), draw(block))
     write_atomic(out / "results.json", (json.dumps(record(document), indent=1) + "\n").encode())

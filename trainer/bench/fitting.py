@@ -6,11 +6,11 @@ import time
 
 import numpy as np
 
-from trainer.bench.figures import Growth, Result, single
-from trainer.bench.training import learner_and_snapshot, made_up_ratings, one_thread
-from trainer.config import load_config
-from trainer.learner import Learner
-from trainer.store import RatedSegment
+from onedemo.bench.figures import Growth, Result, single
+from onedemo.bench.training import learner_and_snapshot, made_up_ratings, one_thread
+from onedemo.config import load_config
+from onedemo.learner import Learner
+from onedemo.store import RatedSegment
 
 _DISTINCT = 350
 

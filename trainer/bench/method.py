@@ -23,23 +23,23 @@ from typing import Any
 
 import numpy as np
 
-from trainer import envs
-from trainer.appearance import learn as learn_appearance
-from trainer.bench.study import Job
-from trainer.config import RunConfig, load_config, split_ratings, to_toml
-from trainer.demos import find_demo
-from trainer.encoders import demo_features, make_encoder
-from trainer.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
-from trainer.files import hold
-from trainer.headless import train
-from trainer.hidden import HiddenStates, hidden_path, load_hidden
-from trainer.learner import Learner
-from trainer.predictor import Snapshot
-from trainer.raters import Oracle
-from trainer.records import Demo
-from trainer.rollouts import Episodes
-from trainer.store import Store
-from trainer.timing import steps_of_frames
+from onedemo import envs
+from onedemo.appearance import learn as learn_appearance
+from onedemo.bench.study import Job
+from onedemo.config import RunConfig, load_config, split_ratings, to_toml
+from onedemo.demos import find_demo
+from onedemo.encoders import demo_features, make_encoder
+from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
+from onedemo.files import hold
+from onedemo.headless import train
+from onedemo.hidden import HiddenStates, hidden_path, load_hidden
+from onedemo.learner import Learner
+from onedemo.predictor import Snapshot
+from onedemo.raters import Oracle
+from onedemo.records import Demo
+from onedemo.rollouts import Episodes
+from onedemo.store import Store
+from onedemo.timing import steps_of_frames
 
 POINTS = 12
 """Of a learning curve."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from trainer.clips import frame_durations, side_by_side
-from trainer.demos import read_frames
-from trainer.records import Demo
-from trainer.render import RenderThread
+from onedemo.clips import frame_durations, side_by_side
+from onedemo.demos import read_frames
+from onedemo.records import Demo
+from onedemo.render import RenderThread
 
 MOST_BYTES = 400_000
 

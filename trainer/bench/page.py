@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import groupby
 
-from trainer.bench.blocks import (
+from onedemo.bench.blocks import (
     Block,
     Bullets,
     Cell,
@@ -21,7 +21,7 @@ from trainer.bench.blocks import (
     is_wide,
     numeric_columns,
     shown,
-)  # fmt: skip
+)
 
 
 def as_html(document: Document) -> str:

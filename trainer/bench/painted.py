@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.figures import Result, Skipped, single
-from trainer.bench.serving import Stocked, annotator_link, bring, stocked
+from onedemo.bench.figures import Result, Skipped, single
+from onedemo.bench.serving import Stocked, annotator_link, bring, stocked
 
 CHROMIUM_FLAGS = [
     "--use-gl=angle",

@@ -1,6 +1,6 @@
 """The job behind the case study: a video of a real person, and a rater that goes by hand-made marks.
 
-Settings of a job are those of ``trainer.bench.method`` without ``demo``; the rater "script", which errors
+Settings of a job are those of ``onedemo.bench.method`` without ``demo``; the rater "script", which errors
 may follow, goes by the marks beside this file. The video is not part of this program.
 """
 
@@ -11,13 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trainer.bench import method
-from trainer.bench.method import whole_config
-from trainer.bench.study import Job
-from trainer.demos import import_video
-from trainer.errors import UserError
-from trainer.files import hold
-from trainer.records import Demo
+from onedemo.bench import method
+from onedemo.bench.method import whole_config
+from onedemo.bench.study import Job
+from onedemo.demos import import_video
+from onedemo.errors import UserError
+from onedemo.files import hold
+from onedemo.records import Demo
 
 VIDEO = "person_backflip_480.mp4"
 VARIABLE = "ONEDEMO_PERSON_VIDEO"
@@ -53,7 +53,7 @@ def person_job(
     label: str, seed: int, *, method: str = "onedemo", rater: str = "script", ratings: int = 350, steps: int,
     changes: Mapping[str, Any] | None = None,
 ) -> Job:  # fmt: skip
-    """A job of kind "person". Arguments as ``trainer.bench.method.method_job``."""
+    """A job of kind "person". Arguments as ``onedemo.bench.method.method_job``."""
     settings = {
         "method": method, "rater": rater, "ratings": ratings, "steps": steps, "set": dict(changes or {}),
     }  # fmt: skip
@@ -61,7 +61,7 @@ def person_job(
 
 
 def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:
-    """Trains on the person's video and evaluates: arguments and result as ``trainer.bench.method.run``."""
+    """Trains on the person's video and evaluates: arguments and result as ``onedemo.bench.method.run``."""
     cache = cache or scratch
     with hold(cache / "lock", wait=True):
         demo = person_demo(cache / "demos")

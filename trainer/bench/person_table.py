@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import Block, Document, Heading, Picture, Text, number
-from trainer.bench.movie import movie
-from trainer.bench.person import person_demo, person_job, video
-from trainer.bench.strip import strip
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.bench.summary import (
+from onedemo.bench.blocks import Block, Document, Heading, Picture, Text, number
+from onedemo.bench.movie import movie
+from onedemo.bench.person import person_demo, person_job, video
+from onedemo.bench.strip import strip
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.bench.summary import (
     Goal,
     Groups,
     curves,
@@ -25,7 +25,7 @@ from trainer.bench.summary import (
     minutes,
     table,
 )
-from trainer.errors import UserError
+from onedemo.errors import UserError
 
 TITLE = "onedemo: a real person's backflip"
 SEEDS = 5

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from trainer import envs, profiling
-from trainer.bench.figures import Growth, Result, Skipped, by_turns, ratio
-from trainer.physics import load_model
-from trainer.priority import cores
+from onedemo import envs, profiling
+from onedemo.bench.figures import Growth, Result, Skipped, by_turns, ratio
+from onedemo.physics import load_model
+from onedemo.priority import cores
 
 LANES = 64
 MISSING = "{} is not installed: pip install -e '.[bench]'"

@@ -17,16 +17,16 @@ import gymnasium
 import numpy as np
 import torch
 
-from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
-from trainer.config import PredictorConfig
-from trainer.demos import find_demo, read_frames
-from trainer.encoders import EfficientNetLite0, demo_features, published_lite0
-from trainer.errors import UserError
-from trainer.folded import SIDE
-from trainer.predictor import visual_inputs
-from trainer.records import Demo
-from trainer.render import RenderThread
-from trainer.video import write_webm
+from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
+from onedemo.config import PredictorConfig
+from onedemo.demos import find_demo, read_frames
+from onedemo.encoders import EfficientNetLite0, demo_features, published_lite0
+from onedemo.errors import UserError
+from onedemo.folded import SIDE
+from onedemo.predictor import visual_inputs
+from onedemo.records import Demo
+from onedemo.render import RenderThread
+from onedemo.video import write_webm
 
 _CLIP = 10  # pictures
 _WIDTH, _HEIGHT = 320, 240
@@ -40,8 +40,8 @@ _CACHED = """
 import sys, time
 from pathlib import Path
 from typing import Any, TypeVar
-from trainer.demos import find_demo
-from trainer.encoders import demo_features, make_encoder
+from onedemo.demos import find_demo
+from onedemo.encoders import demo_features, make_encoder
 demo = find_demo(sys.argv[1], Path(sys.argv[2]))
 began = time.perf_counter()
 demo_features(demo, make_encoder("efficientnet-lite0"), Path(sys.argv[2]))

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from trainer import envs
-from trainer.bench.predictor_scores import spearman
-from trainer.choice import choose
-from trainer.hidden import HiddenStates
-from trainer.learner import Learner
-from trainer.practice import fill_bank
-from trainer.predictor import Snapshot
-from trainer.raters import Oracle
-from trainer.records import Rollouts, Segment
-from trainer.starts import HeldNoise
+from onedemo import envs
+from onedemo.bench.predictor_scores import spearman
+from onedemo.choice import choose
+from onedemo.hidden import HiddenStates
+from onedemo.learner import Learner
+from onedemo.practice import fill_bank
+from onedemo.predictor import Snapshot
+from onedemo.raters import Oracle
+from onedemo.records import Rollouts, Segment
+from onedemo.starts import HeldNoise
 
 STANDING, WILD, OTHERS, ATTEMPTS = "random, standing", "random starts", "other moves", "attempts"
 """The policies whose clips are ranked."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import number
-from trainer.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
-from trainer.bench.predictor_scores import interval
-from trainer.bench.seeds import Spread, spread
-from trainer.bench.study import Outcome
+from onedemo.bench.blocks import number
+from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
+from onedemo.bench.predictor_scores import interval
+from onedemo.bench.seeds import Spread, spread
+from onedemo.bench.study import Outcome
 
 PAPER = {
     "random sampling": (54.22, 42.89, 13.46, 6.97),

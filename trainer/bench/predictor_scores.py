@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trainer.predictor import CLASSES
+from onedemo.predictor import CLASSES
 
 BINS = 10
 """Of a reliability chart, equally wide."""

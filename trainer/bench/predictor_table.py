@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import (
+from onedemo.bench.blocks import (
     Bars,
     Block,
     Bullets,
@@ -23,8 +23,8 @@ from trainer.bench.blocks import (
     Table,
     Text,
 )
-from trainer.bench.predictor_exam import ATTEMPTS, OTHERS
-from trainer.bench.predictor_figures import (
+from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS
+from onedemo.bench.predictor_figures import (
     BESIDES,
     CONTRAST,
     COUNTED,
@@ -42,11 +42,11 @@ from trainer.bench.predictor_figures import (
     findings,
     rank,
 )
-from trainer.bench.predictor_scores import BINS, interval
-from trainer.bench.predictor_trial import VARIANTS
-from trainer.bench.seeds import spread
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.predictor import CLASSES
+from onedemo.bench.predictor_scores import BINS, interval
+from onedemo.bench.predictor_trial import VARIANTS
+from onedemo.bench.seeds import spread
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.predictor import CLASSES
 
 TITLE = "onedemo: how well ratings are predicted (Table 1)"
 SEEDS = 5

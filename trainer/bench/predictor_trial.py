@@ -17,25 +17,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from trainer import appearance
-from trainer.bench.method import prepare
-from trainer.bench.predictor_exam import Exam
-from trainer.bench.predictor_scores import (
-    calibration_error,
-    confusion,
-    f1,
-    macro_f1,
-    reliability,
-)
-from trainer.config import load_config
-from trainer.demos import find_demo
-from trainer.encoders import demo_features
-from trainer.hidden import hidden_path, load_hidden
-from trainer.learner import Learner
-from trainer.predictor import CLASSES, Snapshot
-from trainer.raters import Oracle
-from trainer.records import Demo
-from trainer.store import RatedSegment
+from onedemo import appearance
+from onedemo.bench.method import prepare
+from onedemo.bench.predictor_exam import Exam
+from onedemo.bench.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
+from onedemo.config import load_config
+from onedemo.demos import find_demo
+from onedemo.encoders import demo_features
+from onedemo.hidden import hidden_path, load_hidden
+from onedemo.learner import Learner
+from onedemo.predictor import CLASSES, Snapshot
+from onedemo.raters import Oracle
+from onedemo.records import Demo
+from onedemo.store import RatedSegment
 
 _NETWORK = {"method": "paper"}
 _ONE_LAYER_LESS = _NETWORK | {"predictor.additional_layer": False}

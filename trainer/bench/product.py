@@ -1,7 +1,7 @@
 """The product as people use it: how long a press, a rating and a start take, and how much memory it needs.
 
 The real command runs as a child process; one light process plays the people at its page
-(``trainer.bench.annotators``) and reads the database beside it.
+(``onedemo.bench.annotators``) and reads the database beside it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from trainer.bench.annotators import Press, browser_session, open_tab
-from trainer.bench.figures import Figure, Result, Skipped, ratio, single
-from trainer.bench.serving import Server, Stocked, bring, check_counts, give, reach, serving, stocked
+from onedemo.bench.annotators import Press, browser_session, open_tab
+from onedemo.bench.figures import Figure, Result, Skipped, ratio, single
+from onedemo.bench.serving import Server, Stocked, bring, check_counts, give, reach, serving, stocked
 
 CROWD = 50
 _EVERY_S = {1: 0.4, CROWD: 4.0}
@@ -49,7 +49,9 @@ def help_time(repetitions: int) -> Figure:
     taken = []
     for _ in range(repetitions):
         began = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "app.cli", "--help"], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "onedemo.app.cli", "--help"], check=True, stdout=subprocess.DEVNULL
+        )
         taken.append(time.perf_counter() - began)
     return single("help_s", "command line to --help", taken, unit="s", reach=0.5)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from trainer.bench import backflip_table
-from trainer.bench.blocks import Block, Chart, Document, Line, Reference, Text
-from trainer.bench.method import method_job
-from trainer.bench.seeds import spread
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.bench.summary import Groups, each_seed, figure, minutes, table
+from onedemo.bench import backflip_table
+from onedemo.bench.blocks import Block, Chart, Document, Line, Reference, Text
+from onedemo.bench.method import method_job
+from onedemo.bench.seeds import spread
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.bench.summary import Groups, each_seed, figure, minutes, table
 
 TITLE = "onedemo: how many ratings"
 SEEDS = 5

@@ -19,14 +19,14 @@ from stable_baselines3.common.vec_env import (  # pyright: ignore[reportMissingI
     VecEnv,
 )
 
-from trainer import envs, profiling
-from trainer.bench.figures import Result, by_turns, ratio
-from trainer.bench.physics import stock_hopper
-from trainer.bench.training import LANES, STEPS, one_thread
-from trainer.policy import Policy, PolicyConfig
-from trainer.priority import cores
-from trainer.rollouts import Collector
-from trainer.trpo import Trpo, TrpoConfig
+from onedemo import envs, profiling
+from onedemo.bench.figures import Result, by_turns, ratio
+from onedemo.bench.physics import stock_hopper
+from onedemo.bench.training import LANES, STEPS, one_thread
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.priority import cores
+from onedemo.rollouts import Collector
+from onedemo.trpo import Trpo, TrpoConfig
 
 
 def measure(quick: bool = False) -> list[Result]:

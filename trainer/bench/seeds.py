@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import Line, number
-from trainer.bench.study import Outcome
+from onedemo.bench.blocks import Line, number
+from onedemo.bench.study import Outcome
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

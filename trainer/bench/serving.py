@@ -22,8 +22,8 @@ from typing import IO
 
 from aiohttp import ClientSession
 
-from trainer.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
-from trainer.store import FILE_NAME, NewClip, Store
+from onedemo.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
+from onedemo.store import FILE_NAME, NewClip, Store
 
 _PATIENCE_S = 900.0
 _IN_HAND = 2
@@ -66,7 +66,16 @@ class Server:
     ) -> subprocess.Popen[str]:
         """The process alone, just begun; it says on its standard output when it is ready."""
         # By name: what is measured stands above this package, which imports nothing of it.
-        command = [sys.executable, "-m", "app.cli", "serve", "--data-dir", str(data_dir), "--port", "0"]
+        command = [
+            sys.executable,
+            "-m",
+            "onedemo.app.cli",
+            "serve",
+            "--data-dir",
+            str(data_dir),
+            "--port",
+            "0",
+        ]
         command += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
         command += [word for setting in settings for word in ("--set", setting)]
         command += ["--new-run"] if settings else []

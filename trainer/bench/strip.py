@@ -8,10 +8,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from trainer.clips import SIDE_HEIGHT, SIDE_WIDTH, fit
-from trainer.demos import read_frames
-from trainer.records import Demo
-from trainer.render import RenderThread
+from onedemo.clips import SIDE_HEIGHT, SIDE_WIDTH, fit
+from onedemo.demos import read_frames
+from onedemo.records import Demo
+from onedemo.render import RenderThread
 
 _SHOWN = 8
 _WIDTH, _HEIGHT = 180, 135

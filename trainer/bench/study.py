@@ -23,9 +23,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
-from trainer.errors import UserError
-from trainer.files import hold
-from trainer.priority import cores
+from onedemo.errors import UserError
+from onedemo.files import hold
+from onedemo.priority import cores
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +43,13 @@ class Kind:
 
 
 KINDS = {
-    "method": Kind("trainer.bench.method:run"),
-    "transfer": Kind("trainer.bench.transfer:run"),
-    "person": Kind("trainer.bench.person:run"),
-    "predictor": Kind("trainer.bench.predictor_trial:run", version=2),
-    "handcoded": Kind("trainer.bench.controls:handcoded"),
-    "preferences": Kind("trainer.bench.controls:preferences"),
-    "truth": Kind("trainer.bench.controls:truth"),
+    "method": Kind("onedemo.bench.method:run"),
+    "transfer": Kind("onedemo.bench.transfer:run"),
+    "person": Kind("onedemo.bench.person:run"),
+    "predictor": Kind("onedemo.bench.predictor_trial:run", version=2),
+    "handcoded": Kind("onedemo.bench.controls:handcoded"),
+    "preferences": Kind("onedemo.bench.controls:preferences"),
+    "truth": Kind("onedemo.bench.controls:truth"),
 }
 """By name; a new kind is one line here. "module:function" itself can stand for a kind, too."""
 
@@ -314,7 +314,7 @@ def _start(job: Job, results: Path) -> _Child | Outcome | None:
             **job.description,
         }
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "trainer.bench.worker", json.dumps(request)],
+            [sys.executable, "-P", "-m", "onedemo.bench.worker", json.dumps(request)],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

@@ -1,6 +1,6 @@
 """What tables of trainings have in common: figures out of results, goals, curves, moving pictures.
 
-Results are those of ``trainer.bench.method`` and ``trainer.bench.controls``.
+Results are those of ``onedemo.bench.method`` and ``onedemo.bench.controls``.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import Block, Cell, Chart, Line, Picture, Table, number
-from trainer.bench.movie import movie
-from trainer.bench.seeds import band, spread
-from trainer.bench.study import Outcome
-from trainer.demos import find_demo
-from trainer.errors import UserError
+from onedemo.bench.blocks import Block, Cell, Chart, Line, Picture, Table, number
+from onedemo.bench.movie import movie
+from onedemo.bench.seeds import band, spread
+from onedemo.bench.study import Outcome
+from onedemo.demos import find_demo
+from onedemo.errors import UserError
 
 Result = Mapping[str, Any]
 Groups = Mapping[str, Sequence[Outcome]]

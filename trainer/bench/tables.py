@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
-    from trainer.bench.document import Document
-    from trainer.bench.study import Job, Outcome
+    from onedemo.bench.document import Document
+    from onedemo.bench.study import Job, Outcome
 
 TUNING_FROM = 100
 """Settings are tuned on seeds from here on, which no table reports; reports take 0, 1, 2 and so on."""
@@ -51,12 +51,12 @@ class Entry:
 
 
 TABLES = {
-    "predictor": Entry("trainer.bench.predictor_table", "how well ratings are predicted (Table 1)"),
-    "backflip": Entry("trainer.bench.backflip_table", "what is learned, by which method (Table 2)"),
-    "transfer": Entry("trainer.bench.transfer_table", "what a predictor of another move is worth (Table 3)"),
-    "ratings": Entry("trainer.bench.ratings_table", "how much is learned from how many ratings"),
-    "person": Entry("trainer.bench.person_table", "learning from a video of a real person"),
-    "ablation": Entry("trainer.bench.ablation_table", "what each part of the method contributes"),
+    "predictor": Entry("onedemo.bench.predictor_table", "how well ratings are predicted (Table 1)"),
+    "backflip": Entry("onedemo.bench.backflip_table", "what is learned, by which method (Table 2)"),
+    "transfer": Entry("onedemo.bench.transfer_table", "what a predictor of another move is worth (Table 3)"),
+    "ratings": Entry("onedemo.bench.ratings_table", "how much is learned from how many ratings"),
+    "person": Entry("onedemo.bench.person_table", "learning from a video of a real person"),
+    "ablation": Entry("onedemo.bench.ablation_table", "what each part of the method contributes"),
 }
 """``onedemo bench NAME``; a new table is one module and one line here."""
 

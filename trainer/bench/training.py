@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from trainer.bench.figures import Result, by_turns, ratio, single
-from trainer.bench.physics import Bare, full_states
-from trainer.config import RunConfig, load_config
-from trainer.learner import Learner
-from trainer.predictor import Snapshot
-from trainer.priority import cores
-from trainer.records import Rollouts
-from trainer.store import RatedSegment
+from onedemo.bench.figures import Result, by_turns, ratio, single
+from onedemo.bench.physics import Bare, full_states
+from onedemo.config import RunConfig, load_config
+from onedemo.learner import Learner
+from onedemo.predictor import Snapshot
+from onedemo.priority import cores
+from onedemo.records import Rollouts
+from onedemo.store import RatedSegment
 
 LANES, STEPS = 64, 250
 """Of an iteration: the product's defaults."""

@@ -1,6 +1,6 @@
 """The jobs behind Table 3: a predictor of one move, fine-tuned to another with few ratings.
 
-Settings of a job: ``source`` and ``target``, each the settings of ``trainer.bench.method``, and
+Settings of a job: ``source`` and ``target``, each the settings of ``onedemo.bench.method``, and
 ``demo``, the target's. The source run
 is trained first, for its ratings and its predictor alone; the target run starts from its newest snapshot.
 The result is that of the target run, with what the source cost.
@@ -13,12 +13,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from trainer.bench import method
-from trainer.bench.study import Job
-from trainer.demos import find_demo
-from trainer.headless import train
-from trainer.store import Store
-from trainer.transfer import newest_snapshot
+from onedemo.bench import method
+from onedemo.bench.study import Job
+from onedemo.demos import find_demo
+from onedemo.headless import train
+from onedemo.store import Store
+from onedemo.transfer import newest_snapshot
 
 _RUN = "source"
 
@@ -43,10 +43,10 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         settings: See above.
         seed: Of both.
         scratch: Takes both.
-        cache: As for ``trainer.bench.method.run``.
+        cache: As for ``onedemo.bench.method.run``.
 
     Returns:
-        What ``trainer.bench.method.run`` gives of the target run; ``source`` holds the ratings, control
+        What ``onedemo.bench.method.run`` gives of the target run; ``source`` holds the ratings, control
         steps and seconds of the other.
     """
     cache = cache or scratch

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from trainer.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
-from trainer.bench.method import method_job
-from trainer.bench.seeds import spread, spread_of
-from trainer.bench.strip import strip
-from trainer.bench.study import Job, Outcome, by_label
-from trainer.bench.summary import (
+from onedemo.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
+from onedemo.bench.method import method_job
+from onedemo.bench.seeds import spread, spread_of
+from onedemo.bench.strip import strip
+from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.bench.summary import (
     Groups,
     curves,
     each_seed,
@@ -24,9 +24,9 @@ from trainer.bench.summary import (
     moving_pictures,
     table,
 )
-from trainer.bench.transfer import transfer_job
-from trainer.demos import find_demo
-from trainer.errors import UserError
+from onedemo.bench.transfer import transfer_job
+from onedemo.demos import find_demo
+from onedemo.errors import UserError
 
 TITLE = "onedemo: from one move to another"
 SEEDS = 5

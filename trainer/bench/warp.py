@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from trainer import envs
-from trainer.baselines.handcoded import HandcodedConfig, train_handcoded
-from trainer.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
-from trainer.physics import Physics, RolloutPhysics, load_model
-from trainer.priority import cores
+from onedemo import envs
+from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
+from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
+from onedemo.physics import Physics, RolloutPhysics, load_model
+from onedemo.priority import cores
 
 LANES = (512, 2048, 8192, 32768)
 _SPEC = envs.SPECS["hopper"]
@@ -74,7 +74,7 @@ def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: 
         turns: Repetitions of each side.
         lane_steps: Control steps of a repetition, all lanes together.
     """
-    from trainer.warp import WarpPhysics
+    from onedemo.warp import WarpPhysics
 
     model = load_model(_SPEC.xml)
     rates: dict[str, list[float]] = {}

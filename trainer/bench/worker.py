@@ -1,6 +1,6 @@
-"""One job of a study in a process of its own: ``python -m trainer.bench.worker REQUEST``.
+"""One job of a study in a process of its own: ``python -m onedemo.bench.worker REQUEST``.
 
-REQUEST is JSON, as ``trainer.bench.study`` makes it. The result is written to its file only when the
+REQUEST is JSON, as ``onedemo.bench.study`` makes it. The result is written to its file only when the
 job has finished; whatever else it writes goes into a scratch directory that is removed at the end.
 Standard input is a lifeline: when it ends, so does this process, for the study behind it has gone,
 however it went.
@@ -22,9 +22,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from trainer.bench.document import plain
-from trainer.bench.machine import machine, now, program
-from trainer.files import write_atomic
+from onedemo.bench.document import plain
+from onedemo.bench.machine import machine, now, program
+from onedemo.files import write_atomic
 
 
 def main(request_json: str) -> None:
