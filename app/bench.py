@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from onedemo.bench.tables import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
+from onedemo.core.files import check_writable, write_atomic
 from onedemo.errors import UserError
-from onedemo.files import check_writable, write_atomic
 
 
 def add_commands(actions: Any, command: Callable[..., argparse.ArgumentParser]) -> None:

@@ -241,9 +241,9 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
+    from onedemo.core.files import write_atomic
     from onedemo.demos import find_demo
     from onedemo.encoders import make_encoder
-    from onedemo.files import write_atomic
     from onedemo.headless import train
     from onedemo.store import Store
     from onedemo.transfer import newest_snapshot

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from onedemo.core.files import check_writable
 from onedemo.errors import UserError
-from onedemo.files import check_writable
 
 
 def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -53,7 +53,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from onedemo.answers import SKIP_COLUMNS
     from onedemo.app.card import card
     from onedemo.app.exports import csv_blocks, write_parquet
-    from onedemo.files import write_atomic
+    from onedemo.core.files import write_atomic
     from onedemo.pairs import COMPARISON_COLUMNS
 
     with open_store(arguments, must_exist=True) as store:

@@ -44,7 +44,7 @@ def add_people_commands(commands: Any, command: Callable[..., argparse.ArgumentP
 
 def _add(arguments: argparse.Namespace) -> None:
     from onedemo.app.links import issue_link, passing_link, read_secret, read_span
-    from onedemo.names import check_person
+    from onedemo.core.names import check_person
 
     name = check_person(arguments.name)
     lasts = read_span(arguments.expires) if arguments.expires is not None else None
@@ -99,7 +99,7 @@ def _revoke(arguments: argparse.Namespace) -> None:
 def _audit(arguments: argparse.Namespace) -> None:
     from onedemo.app.exports import csv_blocks
     from onedemo.audit import AUDIT_COLUMNS
-    from onedemo.files import write_atomic
+    from onedemo.core.files import write_atomic
 
     with open_store(arguments, must_exist=True) as store:
         if arguments.csv is not None:

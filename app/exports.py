@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from onedemo.app.parquet import write_segments
-from onedemo.files import replacing
+from onedemo.core.files import replacing
 from onedemo.store import RATING_COLUMNS, Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")

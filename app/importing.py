@@ -10,9 +10,9 @@ from typing import Any
 
 from onedemo.app.columns import RATINGS
 from onedemo.app.parquet import read_about, read_segments
+from onedemo.core.files import write_atomic
+from onedemo.core.names import LONGEST, check_name
 from onedemo.errors import UserError
-from onedemo.files import write_atomic
-from onedemo.names import LONGEST, check_name
 from onedemo.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")

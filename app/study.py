@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
+from onedemo.core.files import hold
 from onedemo.demos import find_demo
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
-from onedemo.files import hold
 from onedemo.loop import Trainer
 from onedemo.predictor import Snapshot, check_start
 from onedemo.records import Demo

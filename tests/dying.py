@@ -22,7 +22,7 @@ import worlds
 
 import onedemo.learner
 import onedemo.practice
-from onedemo import files
+from onedemo.core import files
 from onedemo.headless import train
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo

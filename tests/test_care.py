@@ -30,9 +30,9 @@ from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.bench.annotators import browser_session, open_tab, rating
 from onedemo.bench.serving import reach, serving
 from onedemo.clips import compose_clip
+from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos import import_video
 from onedemo.errors import UserError
-from onedemo.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.predictor import Snapshot
 from onedemo.store import FILE_NAME, Store
 

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
+from onedemo.core.files import hold
 from onedemo.errors import UserError
-from onedemo.files import hold
 
 
 def test_a_lock_that_is_held_is_refused_or_waited_for(tmp_path):

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from onedemo.priority import give_way
+from onedemo.core.cpu import give_way
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has priorities of threads")

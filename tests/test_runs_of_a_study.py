@@ -9,8 +9,8 @@ from onedemo.app import study as module
 from onedemo.app.actions import Actions
 from onedemo.app.study import Study
 from onedemo.asking import Simulated
+from onedemo.core.files import hold
 from onedemo.errors import UserError
-from onedemo.files import hold
 from onedemo.loop import Trainer
 from onedemo.records import Rater
 from onedemo.render import RenderThread

@@ -23,8 +23,8 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo import body, envs
+from onedemo.core.files import read_whole, write_atomic
 from onedemo.encoders import Encoder
-from onedemo.files import read_whole, write_atomic
 from onedemo.render import RenderThread
 from onedemo.starts import wild_rollouts
 

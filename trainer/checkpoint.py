@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-from onedemo.files import read_whole, write_atomic
+from onedemo.core.files import read_whole, write_atomic
 from onedemo.records import Rollouts
 
 _UNSEEN = ("inputs", "next_inputs")

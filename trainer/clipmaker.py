@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.clips import compose_clip
+from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.errors import in_words
-from onedemo.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.records import Clip
 from onedemo.render import Renderer, RenderThread
 from onedemo.store import Store

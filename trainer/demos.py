@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from onedemo import static
+from onedemo.core.files import write_atomic
+from onedemo.core.names import check_name
 from onedemo.demo_checks import check_options
 from onedemo.errors import UserError
-from onedemo.files import write_atomic
 from onedemo.guarded import Limits, Options, decode
-from onedemo.names import check_name
 from onedemo.records import Demo
 from onedemo.timing import steps_of_frames
 from onedemo.video import VideoReader, write_webm

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos import list_demos
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
-from onedemo.files import archive_fault, jpeg_fault
 from onedemo.migrations import STEPS, check_version
 from onedemo.render import HEIGHT, WIDTH, RenderThread
 from onedemo.store import FILE_NAME

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from onedemo.core.files import read_whole, write_atomic
 from onedemo.demos import stream_frames
 from onedemo.errors import UserError
-from onedemo.files import read_whole, write_atomic
 from onedemo.folded import BATCH, SIDE, Folded
 from onedemo.records import Demo
 

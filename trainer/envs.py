@@ -20,9 +20,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from onedemo.core.cpu import cores
 from onedemo.errors import UserError
 from onedemo.physics import load_model, make_physics
-from onedemo.priority import cores
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)

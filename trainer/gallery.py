@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from onedemo.clips import side_by_side
+from onedemo.core.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
 from onedemo.demos import read_frames
-from onedemo.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts
 from onedemo.render import Renderer, RenderThread

@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from onedemo.asking import Simulated
 from onedemo.config import RunConfig
+from onedemo.core.files import hold
 from onedemo.encoders import Encoder
 from onedemo.evaluation import summarise
-from onedemo.files import hold
 from onedemo.hidden import hidden_path, load_hidden
 from onedemo.learner import Learner
 from onedemo.loop import Trainer

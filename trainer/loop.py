@@ -26,16 +26,16 @@ from onedemo.asking import Asking, Simulated
 from onedemo.checkpoint import load_checkpoint, save_checkpoint
 from onedemo.clipmaker import ClipMaker
 from onedemo.config import RunConfig
+from onedemo.core.cpu import give_way
+from onedemo.core.files import read_whole
 from onedemo.demos import read_frames
 from onedemo.encoders import Encoder, demo_features
 from onedemo.errors import in_words
-from onedemo.files import read_whole
 from onedemo.learner import Learner
 from onedemo.motion import TASK_REWARDS
 from onedemo.pairing import Pairing
 from onedemo.policy import PolicySnapshot
 from onedemo.predictor import Snapshot
-from onedemo.priority import give_way
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render import RenderThread
 from onedemo.rollouts import Acting, EpisodeRules, Transitions

@@ -14,7 +14,7 @@ import numpy as np
 
 from onedemo.choice import choose
 from onedemo.clips import compose_clip
-from onedemo.files import jpeg_fault, read_whole, sealed, write_atomic
+from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.learner import Learner
 from onedemo.pairs import NewPair, Pair
 from onedemo.records import Rollouts

@@ -20,8 +20,8 @@ import numpy as np
 import torch
 
 from onedemo.appearance import Track
+from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
-from onedemo.files import archive_fault, write_atomic
 from onedemo.store import RatedSegment
 
 CLASSES = 5

@@ -25,9 +25,9 @@ import mujoco
 import numpy as np
 
 from onedemo.backdrop import Camera, backdrop
+from onedemo.core.cpu import give_way
 from onedemo.errors import UserError
 from onedemo.gl import open_context
-from onedemo.priority import give_way
 
 log = logging.getLogger("onedemo")
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from onedemo.config import RunConfig, load_config, to_toml
+from onedemo.core.files import write_atomic
+from onedemo.core.names import check_name
 from onedemo.errors import UserError
-from onedemo.files import write_atomic
 from onedemo.learner import lengths
-from onedemo.names import check_name
 from onedemo.records import Demo
 from onedemo.store import Store
 

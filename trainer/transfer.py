@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
-from onedemo.files import archive_fault, write_atomic
 from onedemo.store import Store
 
 _KEPT = "start.pt"

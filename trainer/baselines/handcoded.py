@@ -18,11 +18,11 @@ from tqdm import tqdm
 
 from onedemo import envs
 from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.core.cpu import cores
 from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates
 from onedemo.motion import TASK_REWARDS
 from onedemo.policy import Policy, PolicyConfig, check_device
-from onedemo.priority import cores
 from onedemo.rollouts import Collector, evaluate
 from onedemo.trpo import Trpo, TrpoConfig
 

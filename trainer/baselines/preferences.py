@@ -36,11 +36,11 @@ from onedemo.baselines.reward_model import (
 )
 from onedemo.baselines.scores import Score, judge, save_training
 from onedemo.config import split_ratings
+from onedemo.core.cpu import cores
 from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates
 from onedemo.pairs import COMPARISON_COLUMNS
 from onedemo.policy import Policy, PolicyConfig
-from onedemo.priority import cores
 from onedemo.rollouts import Collector, Transitions, evaluate
 from onedemo.store import Store
 from onedemo.trpo import Trpo, TrpoConfig

@@ -27,7 +27,7 @@ from onedemo.bench.blocks import (
 )
 from onedemo.bench.machine import machine, now, program
 from onedemo.bench.page import as_html
-from onedemo.files import write_atomic
+from onedemo.core.files import write_atomic
 
 
 def about(*, command: str, seconds: float | None = None, **more: Any) -> dict[str, Any]:

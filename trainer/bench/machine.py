@@ -9,7 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from onedemo.priority import cores
+from onedemo.core.cpu import cores
 
 _PACKAGES = (
     "mujoco", "gymnasium", "torch", "numpy", "viser", "opencv-python-headless", "envpool", "sb3-contrib",

@@ -27,10 +27,10 @@ from onedemo import envs
 from onedemo.appearance import learn as learn_appearance
 from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
+from onedemo.core.files import hold
 from onedemo.demos import find_demo
 from onedemo.encoders import demo_features, make_encoder
 from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
-from onedemo.files import hold
 from onedemo.headless import train
 from onedemo.hidden import HiddenStates, hidden_path, load_hidden
 from onedemo.learner import Learner

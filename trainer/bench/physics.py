@@ -17,8 +17,8 @@ from mujoco import rollout
 
 from onedemo import envs, profiling
 from onedemo.bench.figures import Growth, Result, Skipped, by_turns, ratio
+from onedemo.core.cpu import cores
 from onedemo.physics import load_model
-from onedemo.priority import cores
 
 LANES = 64
 MISSING = "{} is not installed: pip install -e '.[bench]'"

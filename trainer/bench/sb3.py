@@ -23,8 +23,8 @@ from onedemo import envs, profiling
 from onedemo.bench.figures import Result, by_turns, ratio
 from onedemo.bench.physics import stock_hopper
 from onedemo.bench.training import LANES, STEPS, one_thread
+from onedemo.core.cpu import cores
 from onedemo.policy import Policy, PolicyConfig
-from onedemo.priority import cores
 from onedemo.rollouts import Collector
 from onedemo.trpo import Trpo, TrpoConfig
 

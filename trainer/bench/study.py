@@ -23,9 +23,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from onedemo.core.cpu import cores
+from onedemo.core.files import hold
 from onedemo.errors import UserError
-from onedemo.files import hold
-from onedemo.priority import cores
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,9 @@ import torch
 from onedemo.bench.figures import Result, by_turns, ratio, single
 from onedemo.bench.physics import Bare, full_states
 from onedemo.config import RunConfig, load_config
+from onedemo.core.cpu import cores
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
-from onedemo.priority import cores
 from onedemo.records import Rollouts
 from onedemo.store import RatedSegment
 

@@ -12,8 +12,8 @@ import numpy as np
 from onedemo import envs
 from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
 from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
+from onedemo.core.cpu import cores
 from onedemo.physics import Physics, RolloutPhysics, load_model
-from onedemo.priority import cores
 
 LANES = (512, 2048, 8192, 32768)
 _SPEC = envs.SPECS["hopper"]

@@ -24,7 +24,7 @@ from typing import Any
 
 from onedemo.bench.document import plain
 from onedemo.bench.machine import machine, now, program
-from onedemo.files import write_atomic
+from onedemo.core.files import write_atomic
 
 
 def main(request_json: str) -> None:
