@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 class Actions:

@@ -9,7 +9,7 @@ from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
 from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.words import ANSWERS
 from onedemo.runs import program_version
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 def card(store: Store, run: str | None = None, *, now: datetime | None = None) -> str:

@@ -245,7 +245,7 @@ def _train(arguments: argparse.Namespace) -> None:
     from onedemo.demos import find_demo
     from onedemo.encoders import make_encoder
     from onedemo.headless import train
-    from onedemo.store import Store
+    from onedemo.storage.store import Store
     from onedemo.transfer import newest_snapshot
 
     config = _config(arguments)

@@ -50,11 +50,11 @@ def check_output(file: Path, data_dir: Path) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from onedemo.answers import SKIP_COLUMNS
     from onedemo.app.card import card
     from onedemo.app.exports import csv_blocks, write_parquet
     from onedemo.core.files import write_atomic
-    from onedemo.pairs import COMPARISON_COLUMNS
+    from onedemo.storage.comparisons import COMPARISON_COLUMNS
+    from onedemo.storage.ratings import SKIP_COLUMNS
 
     with open_store(arguments, must_exist=True) as store:
         run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
@@ -96,7 +96,7 @@ def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
     """
     from contextlib import closing
 
-    from onedemo.store import FILE_NAME, Store
+    from onedemo.storage.store import FILE_NAME, Store
 
     if must_exist and not (arguments.data_dir / FILE_NAME).exists():
         raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")

@@ -98,8 +98,8 @@ def _revoke(arguments: argparse.Namespace) -> None:
 
 def _audit(arguments: argparse.Namespace) -> None:
     from onedemo.app.exports import csv_blocks
-    from onedemo.audit import AUDIT_COLUMNS
     from onedemo.core.files import write_atomic
+    from onedemo.storage.audit_log import AUDIT_COLUMNS
 
     with open_store(arguments, must_exist=True) as store:
         if arguments.csv is not None:

@@ -16,7 +16,7 @@ from dataclasses import replace
 from onedemo.app.assignment import Ask, Assignment, Seat, to_repeat, to_share
 from onedemo.marks import seconds_of_pictures
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""

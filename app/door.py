@@ -17,9 +17,9 @@ from onedemo.app import assets
 from onedemo.app.limits import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
 from onedemo.app.links import hash_token, new_session_token
 from onedemo.app.listening import Listening
-from onedemo.people import SESSION_DAYS, Link
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.accounts import SESSION_DAYS, Link
+from onedemo.storage.store import Store
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 Role = Literal["stranger", "annotator", "researcher"]

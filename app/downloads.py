@@ -13,12 +13,12 @@ from typing import Any
 
 from aiohttp import web
 
-from onedemo.answers import SKIP_COLUMNS
 from onedemo.app import exports
 from onedemo.app.card import card
 from onedemo.app.columns import RATINGS
-from onedemo.pairs import COMPARISON_COLUMNS
-from onedemo.store import Store
+from onedemo.storage.comparisons import COMPARISON_COLUMNS
+from onedemo.storage.ratings import SKIP_COLUMNS
+from onedemo.storage.store import Store
 
 FILTERS = ("run", "rater", "stage", "value", "choice", "repeat", "left_out")
 """Columns of the ratings by which they can be filtered."""

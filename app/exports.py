@@ -11,7 +11,7 @@ from pathlib import Path
 
 from onedemo.app.parquet import write_segments
 from onedemo.core.files import replacing
-from onedemo.store import RATING_COLUMNS, Store
+from onedemo.storage.store import RATING_COLUMNS, Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 

@@ -11,7 +11,7 @@ from aiohttp import web
 from onedemo.app import assets
 from onedemo.app.pictures import Pictures
 from onedemo.errors import UserError
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Addresses of what differs between runs or demos end in ?v= and what they are of."""

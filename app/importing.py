@@ -13,7 +13,7 @@ from onedemo.app.parquet import read_about, read_segments
 from onedemo.core.files import write_atomic
 from onedemo.core.names import LONGEST, check_name
 from onedemo.errors import UserError
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
 

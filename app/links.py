@@ -16,7 +16,7 @@ from pathlib import Path
 
 from onedemo.errors import UserError
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 SECRET_FILE = "link-secret"
 SECRET_BYTES = 32

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable
 from onedemo.app.assignment import Assignment, Seat
 from onedemo.app.desk import GUARD_SECONDS, AnsweredElsewhere
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 class PairDesk:

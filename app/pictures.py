@@ -15,7 +15,7 @@ import numpy as np
 from onedemo.clips import compose_clip
 from onedemo.demos import read_frames
 from onedemo.records import Demo
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640

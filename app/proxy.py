@@ -24,7 +24,7 @@ from onedemo.app.limits import (
     Places,
 )
 from onedemo.app.messages import known
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"

@@ -15,7 +15,7 @@ import krippendorff
 import numpy as np
 
 from onedemo import envs
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _CLASSES = 5
 _RESAMPLES = 400

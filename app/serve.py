@@ -18,7 +18,7 @@ from onedemo.encoders import make_encoder
 from onedemo.records import Demo
 from onedemo.render import RenderThread
 from onedemo.runs import add_run, find_run
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _SWITCH_SECONDS = 0.0005
 """A press passes through five threads. Each would wait Python's usual 5 ms for a trainer that computes."""

@@ -19,7 +19,7 @@ from onedemo.predictor import Snapshot, check_start
 from onedemo.records import Demo
 from onedemo.render import RenderThread
 from onedemo.runs import add_run, find_run
-from onedemo.store import Store
+from onedemo.storage.store import Store
 from onedemo.transfer import newest_snapshot
 
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from onedemo.bench.annotators import browser_session, open_tab, rating
 from onedemo.bench.painted import CHROMIUM_FLAGS, find_chromium
 from onedemo.bench.serving import Server, annotator_link
-from onedemo.store import FILE_NAME, Store
+from onedemo.storage.store import FILE_NAME, Store
 
 SETTINGS = [
     "predictor.appearance=false", "ratings.pretrain=30", "ratings.online=1000000", "ratings.rounds=2",

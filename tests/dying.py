@@ -26,7 +26,7 @@ from onedemo.core import files
 from onedemo.headless import train
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo
-from onedemo.store import FILE_NAME, Store
+from onedemo.storage.store import FILE_NAME, Store
 
 MOMENTS = {
     "amid the first ratings": ("store", "rate", 2, True),

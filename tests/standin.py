@@ -10,7 +10,7 @@ import numpy as np
 
 from onedemo.records import Demo, Segment, Status
 from onedemo.rollouts import Acting, EpisodeRules
-from onedemo.store import NewClip, Store
+from onedemo.storage.store import NewClip, Store
 
 FPS = 30.0
 SIZE = (360, 480)
@@ -109,7 +109,7 @@ class StandIn:
 
     def add_pairs(self, count: int) -> list[int]:
         from onedemo.clips import compose_clip
-        from onedemo.pairs import NewPair
+        from onedemo.storage.comparisons import NewPair
 
         pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)
         ids = [pair.id for pair in self.store.add_pairs(self.run, [pair] * count)]

@@ -8,13 +8,13 @@ import sqlite3
 import numpy as np
 import pytest
 
-from onedemo.answers import Answered
 from onedemo.app.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
 from onedemo.app.desk import AnsweredElsewhere, Desk
 from onedemo.asking import Asking
 from onedemo.config import RatingsConfig, RunConfig
 from onedemo.records import Segment
-from onedemo.store import NewClip, Store
+from onedemo.storage.ratings import Answered
+from onedemo.storage.store import NewClip, Store
 
 
 def test_the_first_free_clip_is_leased_and_stays_with_its_page():

@@ -34,7 +34,7 @@ from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos import import_video
 from onedemo.errors import UserError
 from onedemo.predictor import Snapshot
-from onedemo.store import FILE_NAME, Store
+from onedemo.storage.store import FILE_NAME, Store
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
 

@@ -11,8 +11,8 @@ from serving import Serving
 
 from onedemo.app.cli import _parser, main
 from onedemo.config import METHODS
-from onedemo.migrations import STEPS as SCHEMA
-from onedemo.store import FILE_NAME, RATING_COLUMNS, Store
+from onedemo.storage.schema import STEPS as SCHEMA
+from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, Store
 
 
 @pytest.mark.parametrize(

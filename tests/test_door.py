@@ -25,7 +25,7 @@ from onedemo.app.messages import known
 from onedemo.bench.annotators import browser_session, open_tab
 from onedemo.core.names import check_name, check_person
 from onedemo.errors import UserError
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 ROOT = Path(__file__).parents[1]
 CAMERA = {

@@ -14,7 +14,7 @@ from serving import Serving
 from test_page import drag_slider, opened, shown_clip, until
 
 from onedemo.app.cli import main
-from onedemo.store import FILE_NAME
+from onedemo.storage.store import FILE_NAME
 
 pytestmark = pytest.mark.seam
 

@@ -17,7 +17,7 @@ from worlds import falling_demo, small_config
 
 from onedemo.bench.serving import serving
 from onedemo.errors import UserError, in_words
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam
 

@@ -21,7 +21,7 @@ from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
 from onedemo.app.pictures import version_of
 from onedemo.errors import UserError
-from onedemo.store import RATING_COLUMNS, Store
+from onedemo.storage.store import RATING_COLUMNS, Store
 
 pytestmark = pytest.mark.seam
 

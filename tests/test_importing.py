@@ -17,7 +17,7 @@ from onedemo.config import load_config
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
 from onedemo.runs import add_run
-from onedemo.store import RATING_COLUMNS, Store
+from onedemo.storage.store import RATING_COLUMNS, Store
 from onedemo.training_set import TrainingSet
 
 

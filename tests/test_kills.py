@@ -17,7 +17,7 @@ def test_a_rating_that_is_lost_or_doubled_is_noticed(tmp_path):
     import sqlite3
     from contextlib import closing
 
-    from onedemo.store import Store
+    from onedemo.storage.store import Store
 
     with closing(Store(tmp_path)):
         pass

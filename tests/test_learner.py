@@ -8,7 +8,7 @@ from onedemo.evaluation import summarise
 from onedemo.learner import Learner
 from onedemo.metric import MetricSnapshot
 from onedemo.rollouts import evaluate
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from onedemo.app.links import hash_token, issue_link, link_token, new_session_token, read_secret
 from onedemo.errors import UserError
 from onedemo.records import Rater
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 ADA = Rater(id=1, name="ada", role="researcher")
 BO = Rater(id=2, name="bo", role="annotator")

@@ -22,7 +22,7 @@ from onedemo.metric import MetricSnapshot
 from onedemo.practice import PracticeRules
 from onedemo.rollouts import EpisodeRules, evaluate
 from onedemo.runs import add_run, find_run
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 @pytest.fixture(scope="module")

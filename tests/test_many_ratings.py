@@ -9,7 +9,7 @@ from onedemo.app.data import data_html
 from onedemo.app.exports import csv_blocks
 from onedemo.app.quality import quality, quality_by_rater, rating_rows
 from onedemo.bench.data import _RUN, _ask_all, _begin, _fill, _press
-from onedemo.store import RATING_COLUMNS, Store
+from onedemo.storage.store import RATING_COLUMNS, Store
 
 
 @pytest.fixture

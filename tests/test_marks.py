@@ -9,7 +9,7 @@ import pytest
 from onedemo.judge import Judge
 from onedemo.marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.records import Segment
-from onedemo.store import NewClip, RatedSegment, Store
+from onedemo.storage.store import NewClip, RatedSegment, Store
 from onedemo.timing import frame_of_step
 from onedemo.training_set import TrainingSet
 

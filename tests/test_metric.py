@@ -13,7 +13,7 @@ from onedemo.metric import MetricSnapshot
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit
 from onedemo.records import Segment
 from onedemo.starts import wild_rollouts
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 STEPS, FRAMES = 38, 60
 WEIGHTS = np.repeat([[1.0], [0.2]], body.POSE, axis=1)

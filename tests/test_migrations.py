@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from onedemo.errors import UserError
-from onedemo.migrations import STEPS
-from onedemo.store import FILE_NAME, Store
+from onedemo.storage.schema import STEPS
+from onedemo.storage.store import FILE_NAME, Store
 
 STORED = Path(__file__).parent / "databases"
 sys.path.insert(0, str(STORED))
@@ -104,7 +104,9 @@ def test_a_newer_database_is_refused_and_not_touched(tmp_path):
     assert file.read_bytes() == before and [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
 
 
-MIGRATE = "import sys; from pathlib import Path; from onedemo.store import Store; Store(Path(sys.argv[1]))"
+MIGRATE = (
+    "import sys; from pathlib import Path; from onedemo.storage.store import Store; Store(Path(sys.argv[1]))"
+)
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from onedemo.judge import RatingBudgetSpent
 from onedemo.raters import make_rater
 from onedemo.records import Segment
 from onedemo.render import Renderer
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 SOURCE = """
 import numpy as np

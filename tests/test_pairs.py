@@ -19,10 +19,10 @@ from onedemo.demos import read_frames
 from onedemo.errors import UserError
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing, draw_pairs
-from onedemo.pairs import COMPARISON_COLUMNS, NewPair
 from onedemo.records import Segment
 from onedemo.render import RenderThread
-from onedemo.store import Store
+from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
+from onedemo.storage.store import Store
 
 
 def segment(value=0.0, steps=38):

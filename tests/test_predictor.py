@@ -5,7 +5,7 @@ import torch
 from onedemo.network import SimilarityNet, class_weights, standard_inputs
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit, visual_inputs
 from onedemo.records import Segment
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 FRAMES = 60
 

@@ -12,7 +12,7 @@ from onedemo.headless import train
 from onedemo.hidden import HiddenStates
 from onedemo.raters import Oracle, RatingBudgetSpent, appearance, make_rater
 from onedemo.records import Demo, Segment
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 def states(steps=100, spin=-0.03):

@@ -10,9 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from test_page import DESKTOP, GUARD_MS, PHONE, opened, until
 
-from onedemo.answers import SKIP_COLUMNS
 from onedemo.app.cli import main
 from onedemo.app.columns import SKIPS
+from onedemo.storage.ratings import SKIP_COLUMNS
 
 pytestmark = pytest.mark.seam
 

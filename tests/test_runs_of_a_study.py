@@ -15,7 +15,7 @@ from onedemo.loop import Trainer
 from onedemo.records import Rater
 from onedemo.render import RenderThread
 from onedemo.runs import add_run
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam
 

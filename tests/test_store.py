@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from onedemo.errors import UserError
-from onedemo.migrations import STEPS
 from onedemo.records import Segment
-from onedemo.store import FILE_NAME, RATING_COLUMNS, NewClip, Store
+from onedemo.storage.schema import STEPS
+from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, NewClip, Store
 
 
 def segment(value=0.0):
@@ -209,7 +209,7 @@ def test_a_file_that_is_no_database(tmp_path):
 _RATE_AND_DIE = """
 import os, sys
 from pathlib import Path
-from onedemo.store import Store
+from onedemo.storage.store import Store
 store = Store(Path(sys.argv[1]))
 for clip in range(1, 1000):
     store.rate(clip, 1, 3, latency_ms=1)

@@ -8,10 +8,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from onedemo import migrations
-from onedemo.migrations import STEPS, migrate
 from onedemo.records import Segment
-from onedemo.store import FILE_NAME, NewClip, Store
+from onedemo.storage import schema
+from onedemo.storage.schema import STEPS, migrate
+from onedemo.storage.store import FILE_NAME, NewClip, Store
 
 RUNS = ("first", "second")
 STATES = ("cut", "ready", "withdrawn")
@@ -203,7 +203,7 @@ def test_two_processes_may_open_an_old_database_at_once(tmp_path):
 
 def test_a_step_that_fails_leaves_the_database_as_it_was(tmp_path, monkeypatch):
     first_version(tmp_path)
-    monkeypatch.setattr(migrations, "STEPS", (STEPS[0], "CREATE TABLE half (a); CREATE TABLE raters (a);"))
+    monkeypatch.setattr(schema, "STEPS", (STEPS[0], "CREATE TABLE half (a); CREATE TABLE raters (a);"))
     with closing(sqlite3.connect(tmp_path / FILE_NAME, isolation_level=None)) as db:
         with pytest.raises(sqlite3.OperationalError, match="raters"):
             migrate(db)

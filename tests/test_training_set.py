@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from onedemo.records import Segment
-from onedemo.segments import pack_segment, unpack_segment
-from onedemo.store import NewClip, Store
+from onedemo.storage.segment_codec import pack_segment, unpack_segment
+from onedemo.storage.store import NewClip, Store
 from onedemo.training_set import TrainingSet
 
 

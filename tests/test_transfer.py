@@ -18,7 +18,7 @@ from onedemo.loop import Trainer
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.records import Segment
 from onedemo.runs import add_run
-from onedemo.store import RatedSegment, Store
+from onedemo.storage.store import RatedSegment, Store
 from onedemo.transfer import newest_snapshot
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)

@@ -16,7 +16,7 @@ from onedemo.errors import UserError
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
 from onedemo.records import Clip, Rollouts, Segment
-from onedemo.store import NewClip, Store
+from onedemo.storage.store import NewClip, Store
 
 _FULL = 2 / 3
 """Share of the queue that waits before it is filled up for people."""

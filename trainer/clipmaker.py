@@ -15,7 +15,7 @@ from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.errors import in_words
 from onedemo.records import Clip
 from onedemo.render import Renderer, RenderThread
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 log = logging.getLogger("onedemo")
 

@@ -20,9 +20,9 @@ from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos import list_demos
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
-from onedemo.migrations import STEPS, check_version
 from onedemo.render import HEIGHT, WIDTH, RenderThread
-from onedemo.store import FILE_NAME
+from onedemo.storage.schema import STEPS, check_version
+from onedemo.storage.store import FILE_NAME
 from onedemo.transfer import snapshot_file
 
 _LITTLE_ROOM = 1 << 30

@@ -22,7 +22,7 @@ from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle, make_rater, marker
 from onedemo.records import Demo
 from onedemo.runs import add_run, find_run, program_version
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 def train(

@@ -26,7 +26,7 @@ from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, 
 from onedemo.records import Rollouts, Segment
 from onedemo.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.starts import wild_rollouts
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 from onedemo.timing import frame_of_step
 from onedemo.trpo import Trpo
 

@@ -39,7 +39,7 @@ from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render import RenderThread
 from onedemo.rollouts import Acting, EpisodeRules, Transitions
-from onedemo.store import Store
+from onedemo.storage.store import Store
 from onedemo.training_set import TrainingSet
 from onedemo.transfer import keep_start, snapshot_file
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from onedemo.records import Segment
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 from onedemo.timing import frame_of_step
 
 INSIDE, OUTSIDE = 0, 1

@@ -33,7 +33,7 @@ from onedemo import body
 from onedemo.imagined import track_of
 from onedemo.marks import marked_steps
 from onedemo.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 _UPDATES = 300
 _RATE = 0.03

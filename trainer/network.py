@@ -22,7 +22,7 @@ from torch.nn import functional
 from onedemo.errors import UserError
 from onedemo.marks import split_marks
 from onedemo.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 STANDARD_DIMS = 15
 _JUDGED_CLIPS = 2000

@@ -16,10 +16,10 @@ from onedemo.choice import choose
 from onedemo.clips import compose_clip
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.learner import Learner
-from onedemo.pairs import NewPair, Pair
 from onedemo.records import Rollouts
 from onedemo.render import Renderer, RenderThread
-from onedemo.store import Store
+from onedemo.storage.comparisons import NewPair, Pair
+from onedemo.storage.store import Store
 
 log = logging.getLogger("onedemo")
 

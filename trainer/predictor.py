@@ -22,7 +22,7 @@ import torch
 from onedemo.appearance import Track
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 CLASSES = 5
 KINDS = {"network": "onedemo.network", "metric": "onedemo.metric"}

@@ -15,7 +15,7 @@ from onedemo.core.names import check_name
 from onedemo.errors import UserError
 from onedemo.learner import lengths
 from onedemo.records import Demo
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 
 def program_version() -> str:

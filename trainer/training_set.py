@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from onedemo.records import Segment
-from onedemo.store import RatedSegment, Rating, Store
+from onedemo.storage.store import RatedSegment, Rating, Store
 
 
 class TrainingSet:

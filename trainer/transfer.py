@@ -10,7 +10,7 @@ from pathlib import Path
 
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
-from onedemo.store import Store
+from onedemo.storage.store import Store
 
 _KEPT = "start.pt"
 

@@ -39,10 +39,10 @@ from onedemo.config import split_ratings
 from onedemo.core.cpu import cores
 from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates
-from onedemo.pairs import COMPARISON_COLUMNS
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector, Transitions, evaluate
-from onedemo.store import Store
+from onedemo.storage.comparisons import COMPARISON_COLUMNS
+from onedemo.storage.store import Store
 from onedemo.trpo import Trpo, TrpoConfig
 
 

@@ -23,8 +23,8 @@ import numpy as np
 
 from onedemo.bench.figures import Growth, Result, single
 from onedemo.records import Segment
-from onedemo.segments import pack_segment
-from onedemo.store import Store
+from onedemo.storage.segment_codec import pack_segment
+from onedemo.storage.store import Store
 from onedemo.training_set import TrainingSet
 
 _RUN = "bench"

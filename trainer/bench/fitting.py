@@ -10,7 +10,7 @@ from onedemo.bench.figures import Growth, Result, single
 from onedemo.bench.training import learner_and_snapshot, made_up_ratings, one_thread
 from onedemo.config import load_config
 from onedemo.learner import Learner
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 _DISTINCT = 350
 

@@ -38,7 +38,7 @@ from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle
 from onedemo.records import Demo
 from onedemo.rollouts import Episodes
-from onedemo.store import Store
+from onedemo.storage.store import Store
 from onedemo.timing import steps_of_frames
 
 POINTS = 12

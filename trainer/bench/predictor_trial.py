@@ -29,7 +29,7 @@ from onedemo.learner import Learner
 from onedemo.predictor import CLASSES, Snapshot
 from onedemo.raters import Oracle
 from onedemo.records import Demo
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 _NETWORK = {"method": "paper"}
 _ONE_LAYER_LESS = _NETWORK | {"predictor.additional_layer": False}

@@ -23,7 +23,7 @@ from typing import IO
 from aiohttp import ClientSession
 
 from onedemo.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
-from onedemo.store import FILE_NAME, NewClip, Store
+from onedemo.storage.store import FILE_NAME, NewClip, Store
 
 _PATIENCE_S = 900.0
 _IN_HAND = 2

@@ -20,7 +20,7 @@ from onedemo.core.cpu import cores
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
 from onedemo.records import Rollouts
-from onedemo.store import RatedSegment
+from onedemo.storage.store import RatedSegment
 
 LANES, STEPS = 64, 250
 """Of an iteration: the product's defaults."""

@@ -17,7 +17,7 @@ from onedemo.bench import method
 from onedemo.bench.study import Job
 from onedemo.demos import find_demo
 from onedemo.headless import train
-from onedemo.store import Store
+from onedemo.storage.store import Store
 from onedemo.transfer import newest_snapshot
 
 _RUN = "source"

@@ -102,7 +102,7 @@ STEPS: tuple[str, ...] = (
     """,
     # 2: counts kept by triggers, so that what the page asks at every press does not grow with the
     # events. The events stay the one truth: everything here can be worked out from them again.
-    # Segments are written as one NPY from here on (trainer/segments.py); older ones stay NPZ.
+    # Segments are written as one NPY from here on (trainer/storage/segment_codec.py); older ones stay NPZ.
     """
     -- Ratings that hold.
     CREATE TABLE tallies (

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from onedemo.errors import UserError
-from onedemo.migrations import check_version, migrate
+from onedemo.storage.schema import check_version, migrate
 
 FILE_NAME = "onedemo.sqlite3"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from onedemo.database import Database, now
+from onedemo.storage.database import Database, now
 
 AUDIT_COLUMNS = ("at", "who", "what", "detail")
 _LONGEST = 500

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Literal
 
-from onedemo.audit import Audit
-from onedemo.database import now
 from onedemo.errors import UserError
 from onedemo.records import Rater
+from onedemo.storage.audit_log import Audit
+from onedemo.storage.database import now
 
 SESSION_DAYS = 30
 """How long a cookie lets in."""
 
-# A time is compared as text: all are UTC in one form (onedemo.database.now).
+# A time is compared as text: all are UTC in one form (onedemo.storage.database.now).
 _STATE = (
     "CASE WHEN t.revoked_at IS NOT NULL THEN 'revoked' WHEN t.once AND t.last_used_at IS NOT NULL THEN 'used'"
     " WHEN t.expires_at <= :now THEN 'expired' ELSE 'open' END"

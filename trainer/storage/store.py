@@ -7,13 +7,13 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from onedemo.answers import RATING_COLUMNS, Answers, RatedSegment, Rating
-from onedemo.database import FILE_NAME, now
 from onedemo.errors import UserError
-from onedemo.pairs import Pairs
-from onedemo.people import People
 from onedemo.records import Clip, Segment
-from onedemo.segments import pack_segment, unpack_segment
+from onedemo.storage.accounts import People
+from onedemo.storage.comparisons import Pairs
+from onedemo.storage.database import FILE_NAME, now
+from onedemo.storage.ratings import RATING_COLUMNS, Answers, RatedSegment, Rating
+from onedemo.storage.segment_codec import pack_segment, unpack_segment
 
 __all__ = ["FILE_NAME", "RATING_COLUMNS", "NewClip", "RatedSegment", "Rating", "Store"]
 
@@ -35,7 +35,7 @@ class NewClip:
 
 
 class Store(People, Answers, Pairs):
-    """The database in ``data_dir``. Arguments and errors as ``onedemo.database.Database``."""
+    """The database in ``data_dir``. Arguments and errors as ``onedemo.storage.database.Database``."""
 
     # Runs
 
