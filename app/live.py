@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from onedemo import envs
 from onedemo.rollouts import Acting
+from onedemo.sim import vector_env
 
 log = logging.getLogger("onedemo.page")
 
@@ -60,7 +60,7 @@ class Live:
         self, acting: Callable[[], Acting | None], seconds: float, environment: str = "hopper"
     ) -> None:
         self._acting = acting
-        spec = envs.spec(environment)
+        spec = vector_env.spec(environment)
         self.model_path = spec.xml
         self._dt = spec.dt
         self._horizon = max(1, round(seconds / spec.dt))
@@ -91,7 +91,7 @@ class Live:
 
     def _run(self) -> None:
         # One step more than an episode has: it is begun anew here, not by the environment.
-        env = envs.make(self._environment, 1, horizon=self._horizon + 1, nthread=0)
+        env = vector_env.make(self._environment, 1, horizon=self._horizon + 1, nthread=0)
         model = mujoco.MjModel.from_xml_path(str(self.model_path))
         data = mujoco.MjData(model)
         obs, _ = env.reset(seed=0)

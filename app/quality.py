@@ -14,7 +14,7 @@ from typing import NamedTuple
 import krippendorff
 import numpy as np
 
-from onedemo import envs
+from onedemo.sim import vector_env
 from onedemo.storage.store import Store
 
 _CLASSES = 5
@@ -75,7 +75,7 @@ class Quality:
 
 def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
-    dt = envs.spec("hopper").dt
+    dt = vector_env.spec("hopper").dt
     columns = ("clip_id", "rater", "value", "repeat", "latency_ms", "predicted", "steps")
     rows = store.newest_ratings(run, most, columns)
     return [

@@ -14,9 +14,9 @@ import gymnasium
 import numpy as np
 import torch
 
-from onedemo import envs
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector, evaluate
+from onedemo.sim import vector_env
 from onedemo.trpo import Trpo, TrpoConfig
 
 LANES, BATCH, EPISODES = 16, 128, 16
@@ -36,7 +36,7 @@ CONFIG = TrpoConfig(
 def ours(steps, seed):
     """Mean return and seconds of a training of ours."""
     started = time.monotonic()
-    env = envs.make("hopper", LANES, nthread=0, terminate_when_unhealthy=True)
+    env = vector_env.make("hopper", LANES, nthread=0, terminate_when_unhealthy=True)
     policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=1000, seed=seed)
     trpo = Trpo(policy, CONFIG, seed=seed)
     collector = Collector(env, seed=seed, stagger=False)
@@ -45,7 +45,7 @@ def ours(steps, seed):
         trpo.update(batch, batch.env_rewards)
     seconds = time.monotonic() - started
     episodes = evaluate(policy.snapshot(), "hopper", episodes=EPISODES, seed=1000 + seed)
-    upright = envs.healthy(env.env_spec, episodes.qpos, episodes.qvel)
+    upright = vector_env.healthy(env.env_spec, episodes.qpos, episodes.qvel)
     alive = np.logical_and.accumulate(upright[:, :-1], axis=1)  # the falling step still counts
     return (episodes.env_rewards * alive).sum(1).mean(), seconds
 

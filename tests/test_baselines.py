@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import envs
 from onedemo.baselines import handcoded, trajopt
 from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
-from onedemo.motion import (
+from onedemo.policy import Policy, PolicyConfig
+from onedemo.rollouts import evaluate
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import (
     backflip_reward,
     clean_turns,
     clearances,
@@ -21,8 +23,6 @@ from onedemo.motion import (
     task_reward,
     until_fall,
 )
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import evaluate
 
 DEMOS = Path(__file__).parent.parent / "static" / "demos"
 
@@ -98,7 +98,7 @@ def test_timetable():
 
 
 def test_centre_of_mass_is_the_models():
-    env = envs.make("hopper", 1, nthread=0)
+    env = vector_env.make("hopper", 1, nthread=0)
     data = mujoco.MjData(env.model)
     data.qpos[:] = [0.3, 1.1, -2.0, -0.7, -1.1, 0.3]
     mujoco.mj_forward(env.model, data)
@@ -115,7 +115,7 @@ def test_short_optimisation_is_a_real_episode():
     )
     assert straight.qpos.shape == turned.qpos.shape == (106, 6)
     assert (straight.actions != turned.actions).any(), "no flip in 0.1 s: it was tried again"
-    env = envs.make("hopper", 1, nthread=0)
+    env = vector_env.make("hopper", 1, nthread=0)
     env.reset()
     env.set_states(np.array([0]), turned.qpos[:1], turned.qvel[:1])
     for t in range(105):
@@ -166,8 +166,8 @@ def test_shipped_demos(name):
     hidden = load_hidden(DEMOS / f"{name}.hidden.npz")
     assert len(hidden.actions) == 1000
     assert np.abs(hidden.qpos[0] - [0, 1.25, 0, 0, 0, 0]).max() <= 0.005
-    spec = envs.spec("hopper")
-    np.testing.assert_allclose(hidden.obs, envs.observe(spec, hidden.qpos, hidden.qvel))
+    spec = vector_env.spec("hopper")
+    np.testing.assert_allclose(hidden.obs, vector_env.observe(spec, hidden.qpos, hidden.qvel))
     reward = backflip_reward(hidden.obs[1:], hidden.actions).sum()
     if name == "hopper-backflip":
         assert net_turns(hidden.qpos[:, 2]) >= 4

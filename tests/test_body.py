@@ -4,12 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from onedemo import body, envs
-from onedemo.motion import clearances
 from onedemo.raters import appearance
+from onedemo.sim import kinematics, vector_env
+from onedemo.sim.task_rewards import clearances
 from onedemo.starts import random_states, wild_rollouts
 
-HOPPER = envs.spec("hopper")
+HOPPER = vector_env.spec("hopper")
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +24,10 @@ def states():
 def test_pose_is_where_mujoco_puts_the_parts(states):
     model = mujoco.MjModel.from_xml_path(str(HOPPER.xml))
     data = mujoco.MjData(model)
-    for qpos, pose in zip(states[0], body.pose(envs.observe(HOPPER, *states)), strict=True):
+    for qpos, pose in zip(states[0], kinematics.pose(vector_env.observe(HOPPER, *states)), strict=True):
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
-        assert pose[0] == pytest.approx(body.HEIGHT_SCALE * data.body("torso").xpos[2])
+        assert pose[0] == pytest.approx(kinematics.HEIGHT_SCALE * data.body("torso").xpos[2])
         for part, (sine, cosine) in zip(
             ("torso", "thigh", "leg", "foot"), pose[1:].reshape(4, 2), strict=True
         ):
@@ -38,13 +38,13 @@ def test_pose_is_where_mujoco_puts_the_parts(states):
 def test_the_rater_looks_at_the_same_directions(states):
     weights = np.repeat([1.0, 0.7, 0.7, 0.5], 2)
     seen = appearance(*states)[:, 1:9] / weights
-    np.testing.assert_allclose(body.pose(envs.observe(HOPPER, *states))[:, 1:], seen, atol=1e-9)
+    np.testing.assert_allclose(kinematics.pose(vector_env.observe(HOPPER, *states))[:, 1:], seen, atol=1e-9)
 
 
 def test_motion_is_how_the_pose_changes_in_a_simulation():
     rollouts = wild_rollouts("hopper", lanes=32, steps=60, every=60, seed=0, nthread=0)
-    pose, motion = body.pose(rollouts.obs), body.motion(rollouts.obs)
-    change = (pose[:, 2:] - pose[:, :-2]) / (2 * HOPPER.dt) * body.MOTION_SCALE
+    pose, motion = kinematics.pose(rollouts.obs), kinematics.motion(rollouts.obs)
+    change = (pose[:, 2:] - pose[:, :-2]) / (2 * HOPPER.dt) * kinematics.MOTION_SCALE
     # Contacts and the limits of what is observed make jumps that no derivative follows.
     slow = (np.abs(motion) < 1.2).all(axis=-1) & (np.abs(rollouts.qvel) < 9).all(axis=-1)
     free = np.minimum.reduce(list(clearances(rollouts.qpos).values())) > 0.05
@@ -60,22 +60,26 @@ def test_motion_is_the_derivative_of_the_pose(states):
     """One step along the velocities, with no physics in it."""
     qpos, qvel = states
     qvel = np.clip(qvel, -5, 5) / 2  # within what is observed and shown
-    after, before = (body.pose(envs.observe(HOPPER, qpos + h * qvel, qvel)) for h in (1e-5, -1e-5))
-    derivative = body.MOTION_SCALE * (after - before) / 2e-5
-    np.testing.assert_allclose(body.motion(envs.observe(HOPPER, qpos, qvel)), derivative, atol=1e-6)
+    after, before = (
+        kinematics.pose(vector_env.observe(HOPPER, qpos + h * qvel, qvel)) for h in (1e-5, -1e-5)
+    )
+    derivative = kinematics.MOTION_SCALE * (after - before) / 2e-5
+    np.testing.assert_allclose(
+        kinematics.motion(vector_env.observe(HOPPER, qpos, qvel)), derivative, atol=1e-6
+    )
 
 
 def test_motion_is_limited():
     obs = np.zeros((2, 11))
     obs[:, 7:11] = [[10, -10, -10, -10], [0, 0, 0, 0]]  # the foot turns at 40 rad/s
-    fast, still = body.motion(obs)
-    assert np.abs(fast).max() == pytest.approx(body.MOTION_SCALE * 12)
+    fast, still = kinematics.motion(obs)
+    assert np.abs(fast).max() == pytest.approx(kinematics.MOTION_SCALE * 12)
     assert not still.any()
 
 
 def test_shapes_and_turns():
     obs = np.random.default_rng(1).normal(size=(2, 3, 11))
     turned = obs + 2 * np.pi * np.eye(11)[1]
-    assert body.pose(obs).shape == body.motion(obs).shape == (2, 3, body.POSE)
-    np.testing.assert_allclose(body.pose(turned), body.pose(obs), atol=1e-9)
-    np.testing.assert_allclose(body.motion(turned), body.motion(obs), atol=1e-9)
+    assert kinematics.pose(obs).shape == kinematics.motion(obs).shape == (2, 3, kinematics.POSE)
+    np.testing.assert_allclose(kinematics.pose(turned), kinematics.pose(obs), atol=1e-9)
+    np.testing.assert_allclose(kinematics.motion(turned), kinematics.motion(obs), atol=1e-9)

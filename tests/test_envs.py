@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-from onedemo import envs
 from onedemo.errors import UserError
+from onedemo.sim import vector_env
 
 STEPS = 300
 
@@ -24,7 +24,7 @@ def actions_for(seed, lanes, steps, scale=1.5):
 @pytest.mark.parametrize("seed", range(4))
 def test_equals_gymnasium(seed):
     """Observations and rewards of Hopper-v5, 300 steps, falling and tumbling included."""
-    env = envs.make("hopper", 5, nthread=2)
+    env = vector_env.make("hopper", 5, nthread=2)
     env.reset(seed=seed)
     single = [stock() for _ in range(5)]
     for lane, one in enumerate(single):
@@ -42,7 +42,7 @@ def test_equals_gymnasium(seed):
 
 
 def test_one_lane_starts_as_gymnasium_does():
-    env = envs.make("hopper", 1, nthread=0)
+    env = vector_env.make("hopper", 1, nthread=0)
     obs, _ = env.reset(seed=7)
     expected, _ = stock().reset(seed=7)
     np.testing.assert_array_equal(obs[0], expected)
@@ -51,7 +51,7 @@ def test_one_lane_starts_as_gymnasium_does():
 
 
 def test_termination_is_the_stock_rule():
-    env = envs.make("hopper", 16, nthread=0, terminate_when_unhealthy=True)
+    env = vector_env.make("hopper", 16, nthread=0, terminate_when_unhealthy=True)
     env.reset(seed=0)
     single = gymnasium.make("Hopper-v5").unwrapped
     single.reset(seed=0)
@@ -74,7 +74,7 @@ def test_termination_is_the_stock_rule():
 
 
 def test_time_limit_truncates_and_restarts_in_the_same_step():
-    env = envs.make("hopper", 3, horizon=4, nthread=0)
+    env = vector_env.make("hopper", 3, horizon=4, nthread=0)
     assert env.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
     env.reset(seed=0)
     for t in range(1, 9):
@@ -87,12 +87,12 @@ def test_time_limit_truncates_and_restarts_in_the_same_step():
     assert (env.elapsed == 0).all()
     np.testing.assert_array_equal(
         infos["final_obs"],
-        envs.observe(env.env_spec, infos["final_qpos"], infos["final_qvel"]),
+        vector_env.observe(env.env_spec, infos["final_qpos"], infos["final_qvel"]),
     )
 
 
 def test_spaces_and_gymnasium_wrappers():
-    env = envs.make("hopper", 4, horizon=10, nthread=0)
+    env = vector_env.make("hopper", 4, horizon=10, nthread=0)
     wrapped = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
     obs, _ = wrapped.reset(seed=1)
     assert env.observation_space.contains(obs)
@@ -107,7 +107,7 @@ def test_spaces_and_gymnasium_wrappers():
 
 
 def test_stagger_spreads_the_lanes_over_the_episode():
-    env = envs.make("hopper", 10, horizon=100, nthread=0)
+    env = vector_env.make("hopper", 10, horizon=100, nthread=0)
     env.reset(seed=0, options={"stagger": True})
     assert (env.elapsed == 0).all()
     ends = {}
@@ -120,7 +120,7 @@ def test_stagger_spreads_the_lanes_over_the_episode():
 
 
 def test_reset_mask_leaves_the_other_lanes_alone():
-    env = envs.make("hopper", 4, nthread=0)
+    env = vector_env.make("hopper", 4, nthread=0)
     env.reset(seed=0)
     for action in actions_for(1, 4, 20):
         env.step(action)
@@ -133,7 +133,7 @@ def test_reset_mask_leaves_the_other_lanes_alone():
 
 
 def test_set_states():
-    env = envs.make("hopper", 4, horizon=50, nthread=0)
+    env = vector_env.make("hopper", 4, horizon=50, nthread=0)
     env.reset(seed=0)
     qpos = np.tile([0.5, 1.4, -2.0, -0.3, -0.5, 0.2], (2, 1))
     qvel = np.tile([1.0, 2.0, -12.0, 0.0, 0.0, 0.0], (2, 1))
@@ -157,26 +157,26 @@ def test_saved_state_goes_on_exactly():
             seen.append((obs, rewards, truncated))
         return seen
 
-    env = envs.make("hopper", 6, horizon=25, nthread=2)
+    env = vector_env.make("hopper", 6, horizon=25, nthread=2)
     env.reset(seed=3, options={"stagger": True})
     run(env, 0, 30)
     saved = env.state_dict()
     expected = run(env, 30, 60)
-    resumed = envs.make("hopper", 6, horizon=25, nthread=0)
+    resumed = vector_env.make("hopper", 6, horizon=25, nthread=0)
     resumed.load_state_dict(saved)
     for ours, theirs in zip(run(resumed, 30, 60), expected, strict=True):
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="saved state"):
-        envs.make("hopper", 5, nthread=0).load_state_dict(saved)
+        vector_env.make("hopper", 5, nthread=0).load_state_dict(saved)
 
 
 def test_bad_input():
     with pytest.raises(UserError, match="choose one of: hopper"):
-        envs.make("hoper", 4)
+        vector_env.make("hoper", 4)
     with pytest.raises(ValueError, match="at least 1"):
-        envs.make("hopper", 0)
-    env = envs.make("hopper", 2, nthread=0)
+        vector_env.make("hopper", 0)
+    env = vector_env.make("hopper", 2, nthread=0)
     with pytest.raises(ValueError, match="actions must be"):
         env.step(np.zeros(3))
     with pytest.raises(ValueError, match="staggr"):
@@ -187,7 +187,7 @@ def test_stepping_without_the_search_for_islands_changes_no_bit():
     """A lane that falls and lies, so that several contacts act at once."""
     ends = []
     for islands in (False, True):
-        env = envs.make("hopper", 8, nthread=0)
+        env = vector_env.make("hopper", 8, nthread=0)
         flag = mujoco.mjtDisableBit.mjDSBL_ISLAND.value
         assert env.model.opt.disableflags & flag
         if islands:
@@ -203,10 +203,10 @@ def test_stepping_without_the_search_for_islands_changes_no_bit():
 
 
 def test_spec_says_what_the_model_is():
-    for name, spec in envs.SPECS.items():
-        env = envs.make(name, 1, nthread=0)
+    for name, spec in vector_env.SPECS.items():
+        env = vector_env.make(name, 1, nthread=0)
         assert env.model.opt.timestep == spec.timestep
         assert env.model.nq - 1 + env.model.nv == spec.obs_size
         assert env.model.nu == spec.action_size
         assert spec.camera in [env.model.cam(i).name for i in range(env.model.ncam)]
-    assert envs.spec("hopper").dt == pytest.approx(0.008)
+    assert vector_env.spec("hopper").dt == pytest.approx(0.008)

@@ -5,7 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from onedemo import envs
 from onedemo.alignment import align
 from onedemo.bench.controls import TrueRating
 from onedemo.demos import BUILT_IN, find_demo
@@ -13,6 +12,7 @@ from onedemo.evaluation import aligned_similarity, per_episode, spread, state_er
 from onedemo.hidden import load_hidden
 from onedemo.raters import Oracle
 from onedemo.rollouts import Episodes
+from onedemo.sim import vector_env
 from onedemo.timing import steps_of_frames
 
 
@@ -96,7 +96,7 @@ def test_the_true_rating_is_the_oracles(clean, tmp_path):
     demo = find_demo("hopper-flip-clean", tmp_path)
     hop = load_hidden(BUILT_IN / "hopper-hop.hidden.npz")
     snapshot, oracle = TrueRating(demo, clean), Oracle(clean, budget=0)
-    frames, dt = np.arange(demo.frames), envs.spec("hopper").dt
+    frames, dt = np.arange(demo.frames), vector_env.spec("hopper").dt
     steps = steps_of_frames(demo.frames, dt, demo.fps)
     assert (snapshot.ratings(frames, clean.obs[steps], clean.actions[steps]) == 5).all()
     ratings = snapshot.ratings(frames, hop.obs[steps], hop.actions[steps])

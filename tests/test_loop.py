@@ -12,7 +12,6 @@ import torch
 from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
 import onedemo
-from onedemo import envs
 from onedemo.appearance import regress
 from onedemo.asking import Simulated, due_in_round
 from onedemo.headless import train
@@ -22,6 +21,7 @@ from onedemo.metric import MetricSnapshot
 from onedemo.practice import PracticeRules
 from onedemo.rollouts import EpisodeRules, evaluate
 from onedemo.runs import add_run, find_run
+from onedemo.sim import vector_env
 from onedemo.storage.store import Store
 
 
@@ -264,7 +264,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     assert isinstance(one.rules, PracticeRules)
     learner, snapshot = trainer_.final_policy()
     np.testing.assert_array_equal(one.policy.weights[0], learner.policy().weights[0])
-    env = envs.make("hopper", 1, horizon=101, nthread=0)
+    env = vector_env.make("hopper", 1, horizon=101, nthread=0)
     obs, _ = env.reset(seed=5)
     expected = evaluate(
         learner.policy(), "hopper", episodes=1, seed=5, horizon=100,

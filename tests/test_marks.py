@@ -122,9 +122,9 @@ def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
 @pytest.fixture
 def view_of_two():
     """Ratings whose marks blame the spin, not the height; and which log weights tell."""
-    from onedemo import body
     from onedemo.appearance import Track
     from onedemo.predictor import View
+    from onedemo.sim import kinematics
 
     rng = np.random.default_rng(0)
     still = np.zeros(11)
@@ -141,7 +141,8 @@ def view_of_two():
         )
         ratings.append(RatedSegment(event=i + 1, demo_step=0, segment=segment, value=value, mark=(W // 2, W)))
     track = Track(
-        pose=body.pose(still[None]).astype(np.float32), motion=body.motion(still[None]).astype(np.float32)
+        pose=kinematics.pose(still[None]).astype(np.float32),
+        motion=kinematics.motion(still[None]).astype(np.float32),
     )
     view = View(
         visual=np.zeros((1, 2), np.float32), track=track, basis=np.zeros((1, 2), np.float32), fps=30.0
@@ -149,10 +150,12 @@ def view_of_two():
 
     moved = still.copy()
     moved[0] += 1
-    height = int(np.abs(body.pose(moved[None]) - body.pose(still[None]))[0].argmax())
+    height = int(np.abs(kinematics.pose(moved[None]) - kinematics.pose(still[None]))[0].argmax())
     moved = still.copy()
     moved[7] += 1
-    spin = body.POSE + int(np.abs(body.motion(moved[None]) - body.motion(still[None]))[0].argmax())
+    spin = kinematics.POSE + int(
+        np.abs(kinematics.motion(moved[None]) - kinematics.motion(still[None]))[0].argmax()
+    )
 
     def weight_of(snapshot):
         return snapshot.log_weights[0, height], snapshot.log_weights[0, spin]

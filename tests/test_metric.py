@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import body
 from onedemo.appearance import Track
 from onedemo.imagined import track_basis
 from onedemo.metric import MetricSnapshot
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit
 from onedemo.records import Segment
+from onedemo.sim import kinematics
 from onedemo.starts import wild_rollouts
 from onedemo.storage.store import RatedSegment
 
 STEPS, FRAMES = 38, 60
-WEIGHTS = np.repeat([[1.0], [0.2]], body.POSE, axis=1)
+WEIGHTS = np.repeat([[1.0], [0.2]], kinematics.POSE, axis=1)
 """Of pose and motion: what this rater looks at. Torso alone in the motion, the foot not at all."""
 WEIGHTS[0, 7:] = 0.0
 WEIGHTS[1, :1] = WEIGHTS[1, 3:] = 0.0
@@ -41,14 +41,17 @@ def rollouts():
 def view(rollouts):
     """A demo that shows what lane 0 did, for two seconds."""
     obs = rollouts.obs[0, :250][np.round(np.arange(FRAMES) / 30 / 0.008).astype(int)]
-    track = Track(pose=body.pose(obs).astype(np.float32), motion=body.motion(obs).astype(np.float32))
+    track = Track(
+        pose=kinematics.pose(obs).astype(np.float32), motion=kinematics.motion(obs).astype(np.float32)
+    )
     visual = np.random.default_rng(0).normal(size=(FRAMES, 4)).astype(np.float32)
     return View(visual=visual, track=track, basis=np.ones((len(visual), 1), np.float32), fps=30.0)
 
 
 def true_distance(view, frames, obs):
     difference = np.stack(
-        [view.track.pose[frames] - body.pose(obs), view.track.motion[frames] - body.motion(obs)], axis=-2
+        [view.track.pose[frames] - kinematics.pose(obs), view.track.motion[frames] - kinematics.motion(obs)],
+        axis=-2,
     )
     return np.sqrt((WEIGHTS * np.square(difference)).sum(axis=(-1, -2)))
 
@@ -90,7 +93,9 @@ def fitted(rollouts, view):
 def test_it_finds_what_the_rater_looks_at(fitted):
     snapshot, stats, *_ = fitted
     log_weights = snapshot.tensors()["log_weights"].numpy().mean(axis=0)
-    gained = log_weights - np.repeat([-1.0, -2.0], body.POSE)  # what was taken for granted before any rating
+    gained = log_weights - np.repeat(
+        [-1.0, -2.0], kinematics.POSE
+    )  # what was taken for granted before any rating
     seen = WEIGHTS.ravel() > 0
     assert gained[seen].mean() > gained[~seen].mean() + 1.0
     assert gained[1:7].min() > gained[7:9].max()  # torso, thigh and leg matter more than the foot
@@ -179,7 +184,7 @@ def test_probabilities_are_an_ordered_logit_of_the_distance(fitted, view):
     np.testing.assert_allclose(chances.sum(axis=-1), 1, atol=1e-5)
     assert chances.min() >= 0
     track = np.concatenate([view.track.pose, view.track.motion], axis=-1)
-    difference = track[frames] - np.concatenate([body.pose(obs), body.motion(obs)], axis=-1)
+    difference = track[frames] - np.concatenate([kinematics.pose(obs), kinematics.motion(obs)], axis=-1)
     numbers = {name: x.numpy() for name, x in snapshot.tensors().items()}
     for member in range(3):
         weights = np.exp(numbers["log_weights"][member])
@@ -252,7 +257,7 @@ def test_a_saved_snapshot_is_the_same(fitted, tmp_path):
 @pytest.fixture(scope="module")
 def blind(view):
     """The same demo, of which only features of its frames are seen: a mixture of the poses."""
-    mixture = np.random.default_rng(3).normal(size=(body.POSE, 30))
+    mixture = np.random.default_rng(3).normal(size=(kinematics.POSE, 30))
     features = np.tanh(view.track.pose @ mixture).astype(np.float32)
     return replace(view, track=None, basis=track_basis(features, view.fps))
 

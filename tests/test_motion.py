@@ -4,22 +4,22 @@ import mujoco
 import numpy as np
 import pytest
 
-from onedemo import envs, motion
 from onedemo.demos import BUILT_IN
 from onedemo.hidden import load_hidden
+from onedemo.sim import task_rewards, vector_env
 
 DT = 0.008
 
 
 def test_net_turns():
     two_and_a_half = np.linspace(0, -5 * np.pi, 200)
-    assert motion.net_turns(two_and_a_half) == 2
-    assert motion.net_turns(-two_and_a_half) == -2
-    assert motion.net_turns(np.array([0.0, 0.1])) == 0, "a slight forward lean is no turn"
+    assert task_rewards.net_turns(two_and_a_half) == 2
+    assert task_rewards.net_turns(-two_and_a_half) == -2
+    assert task_rewards.net_turns(np.array([0.0, 0.1])) == 0, "a slight forward lean is no turn"
     wrapped = np.angle(np.exp(1j * two_and_a_half))
-    assert motion.net_turns(wrapped) == 2
+    assert task_rewards.net_turns(wrapped) == 2
     there_and_back = np.concatenate([two_and_a_half, two_and_a_half[::-1]])
-    np.testing.assert_array_equal(motion.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0])
+    np.testing.assert_array_equal(task_rewards.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0])
 
 
 def path(angles, heights):
@@ -34,20 +34,20 @@ def test_clean_turns_count_only_what_the_foot_carries():
     high, low = np.full(100, 3.0), np.full(100, 0.3)
     flying = path(turn, high)
     rolling = path(turn, low)
-    assert motion.clean_turns(flying) == 1
-    assert motion.clean_turns(rolling) == 0
+    assert task_rewards.clean_turns(flying) == 1
+    assert task_rewards.clean_turns(rolling) == 0
     # One clean turn, one on the ground, one clean: two, though three turns were made.
     mixed = np.concatenate([flying, rolling, flying])
     mixed[100:, 2] += turn[-1]
     mixed[200:, 2] += turn[-1]
-    assert motion.net_turns(mixed[:, 2]) == 3
-    assert motion.clean_turns(mixed) == 2
+    assert task_rewards.net_turns(mixed[:, 2]) == 3
+    assert task_rewards.clean_turns(mixed) == 2
     # A touch half-way through a turn leaves two halves: nothing.
     touch = flying.copy()
     touch[50, 1] = 0.2  # upside down: the head
-    assert motion.clean_turns(touch) == 0
-    np.testing.assert_array_equal(motion.clean_turns(np.stack([flying, rolling])), [1, 0])
-    assert motion.clean_turns(path(-turn, high)) == -1
+    assert task_rewards.clean_turns(touch) == 0
+    np.testing.assert_array_equal(task_rewards.clean_turns(np.stack([flying, rolling])), [1, 0])
+    assert task_rewards.clean_turns(path(-turn, high)) == -1
 
 
 def demo_positions(name):
@@ -58,31 +58,31 @@ def test_landings_of_the_demos():
     """The clean demo lands its three flips; the tumbling one never stands, the hop never turns."""
     clean, tumbling, hop = map(demo_positions, ("hopper-flip-clean", "hopper-backflip", "hopper-hop"))
     lanes = np.stack([clean, tumbling, hop])
-    np.testing.assert_array_equal(motion.landings(lanes, DT), [3, 0, 0])
-    np.testing.assert_array_equal(motion.net_turns(lanes[..., 2]), [3, 9, 0])
+    np.testing.assert_array_equal(task_rewards.landings(lanes, DT), [3, 0, 0])
+    np.testing.assert_array_equal(task_rewards.net_turns(lanes[..., 2]), [3, 9, 0])
 
 
 def test_a_landing_is_on_the_foot_upright_and_lasts():
     clean = demo_positions("hopper-flip-clean")
     first = 300  # stands after its first flip
-    assert motion.landings(clean[:first], DT) == 1
-    over = int((clean[:, 2] <= motion.LANDED_LEAN - 2 * np.pi).argmax())
-    stay = round(motion.LANDED_FOR_S / DT)
-    assert motion.landings(clean[: over + stay - 1], DT) == 0, "too short to tell"
+    assert task_rewards.landings(clean[:first], DT) == 1
+    over = int((clean[:, 2] <= task_rewards.LANDED_LEAN - 2 * np.pi).argmax())
+    stay = round(task_rewards.LANDED_FOR_S / DT)
+    assert task_rewards.landings(clean[: over + stay - 1], DT) == 0, "too short to tell"
     floating = clean[:first].copy()
     floating[over:, 1] += 0.5
-    assert motion.landings(floating, DT) == 0, "the foot never touches the ground"
+    assert task_rewards.landings(floating, DT) == 0, "the foot never touches the ground"
     lying = clean[:first].copy()
     lying[over:, 1] = 0.2
-    assert motion.landings(lying, DT) == 0
+    assert task_rewards.landings(lying, DT) == 0
     leaning = clean[:first].copy()
     leaning[over:, 2] -= 1.0
-    assert motion.landings(leaning, DT) == 0
+    assert task_rewards.landings(leaning, DT) == 0
     late = np.concatenate([clean[:over], np.repeat(floating[over : over + 1], 100, 0), clean[over:first]])
-    assert motion.landings(late, DT) == 0, "0.8 s in the air after the turn is over"
+    assert task_rewards.landings(late, DT) == 0, "0.8 s in the air after the turn is over"
     shift = clean[:first].copy()
     shift[:, 2] = np.angle(np.exp(1j * shift[:, 2]))
-    assert motion.landings(shift, DT) == 1, "wrapped angles"
+    assert task_rewards.landings(shift, DT) == 1, "wrapped angles"
 
 
 def random_qpos(count, seed):
@@ -93,18 +93,18 @@ def random_qpos(count, seed):
 
 def test_geometry_is_the_models():
     """Joints and clearances against MuJoCo's own kinematics and contacts."""
-    env = envs.make("hopper", 1, nthread=0)
+    env = vector_env.make("hopper", 1, nthread=0)
     model, data = env.model, mujoco.MjData(env.model)
     contacts = 0
     poses = random_qpos(300, 0)
     # The last ones rest within the contact margin: a part lies on the ground before it reaches it.
-    gaps = motion.clearances(poses[250:])
+    gaps = task_rewards.clearances(poses[250:])
     lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
     poses[250:, 1] += np.linspace(0.0001, 0.004, 50) - lowest
     for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        points, gaps = motion.joint_points(qpos), motion.clearances(qpos)
+        points, gaps = task_rewards.joint_points(qpos), task_rewards.clearances(qpos)
         for joint, point in (("thigh", "hip"), ("leg", "knee"), ("foot", "ankle")):
             np.testing.assert_allclose(
                 data.joint(f"{joint}_joint").xanchor[[0, 2]], points[point], atol=1e-12
@@ -117,7 +117,7 @@ def test_geometry_is_the_models():
         ids = [model.geom(f"{part}_geom").id for part in ("torso", "thigh", "leg")]
         pairs = [set(pair) for pair in data.contact.geom]
         touching = any({floor, i} in pairs for i in ids)
-        assert motion.fallen(qpos) == touching
+        assert task_rewards.fallen(qpos) == touching
         contacts += touching
     assert 50 < contacts < 270
 
@@ -128,17 +128,17 @@ def test_backflip_reward_by_hand():
     obs[[0, 5, 7, 8, 9, 10]] = 1, -2, -3, 4, 5, 6
     actions = np.array([2.0, -1.0, 0.5])
     # clipped: work 4 - 5 + 3 = 2;  3 (1 + 0.3 + 0.2 + 0.1) = 4.8
-    assert motion.backflip_reward(obs, actions) == pytest.approx(4.8)
+    assert task_rewards.backflip_reward(obs, actions) == pytest.approx(4.8)
     # raw: work 8 - 5 + 3 = 6;  3 (1 + 0.3 + 0.6 + 0.1) = 6
-    assert motion.backflip_reward(obs, actions, clip_actions=False) == pytest.approx(6.0)
-    assert motion.backflip_reward(np.tile(obs, (4, 5, 1)), np.tile(actions, (4, 5, 1))).shape == (
+    assert task_rewards.backflip_reward(obs, actions, clip_actions=False) == pytest.approx(6.0)
+    assert task_rewards.backflip_reward(np.tile(obs, (4, 5, 1)), np.tile(actions, (4, 5, 1))).shape == (
         4,
         5,
     )
 
 
 def test_hop_reward_is_the_environments():
-    env = envs.make("hopper", 8, nthread=0)
+    env = vector_env.make("hopper", 8, nthread=0)
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.5, 1.5, (80, 8, 3))
     qpos, qvel, rewards = [env.qpos], [env.qvel], []
@@ -148,11 +148,11 @@ def test_hop_reward_is_the_environments():
         qvel.append(env.qvel)
     qpos, qvel = np.stack(qpos, 1), np.stack(qvel, 1)
     actions, rewards = actions.swapaxes(0, 1), np.stack(rewards, 1)
-    obs = envs.observe(env.env_spec, qpos, qvel)
-    np.testing.assert_allclose(motion.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9)
-    assert motion.task_reward("backflip", obs, actions, qpos, qvel).shape == (8, 80)
-    alive = motion.until_fall(qpos[:, 1:], qvel[:, 1:])
-    upright = envs.healthy(env.env_spec, qpos[:, 1:], qvel[:, 1:])
+    obs = vector_env.observe(env.env_spec, qpos, qvel)
+    np.testing.assert_allclose(task_rewards.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9)
+    assert task_rewards.task_reward("backflip", obs, actions, qpos, qvel).shape == (8, 80)
+    alive = task_rewards.until_fall(qpos[:, 1:], qvel[:, 1:])
+    upright = vector_env.healthy(env.env_spec, qpos[:, 1:], qvel[:, 1:])
     first_fall = (~upright).argmax(1)
     assert (~upright).any(1).all()
     np.testing.assert_array_equal(alive.sum(1), first_fall + 1)

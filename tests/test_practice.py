@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import envs
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.practice import Bank, PracticeConfig, PracticeRules, fill_bank
 from onedemo.predictor import PredictorConfig, Snapshot
 from onedemo.rollouts import Collector, Step
+from onedemo.sim import vector_env
 from onedemo.starts import wild_rollouts
 
 DEMO_STEPS = 400
@@ -279,7 +279,7 @@ def test_practice_in_the_real_environment():
     config = PracticeConfig(slack_seconds=6 * DT, give_up=0.3)
     rules = make_rules(config, lanes=lanes, demo_steps=horizon)
     rules.use(Leaning(6.0), bank)
-    env = envs.make("hopper", lanes, horizon=horizon, nthread=0)
+    env = vector_env.make("hopper", lanes, horizon=horizon, nthread=0)
     policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=horizon, seed=0)
     rollouts = Collector(env, seed=0, rules=rules).collect(policy.snapshot(), 200)
     moved = rollouts.next_clock - rollouts.clock

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import envs
 from onedemo.app.cli import main
 from onedemo.baselines import preferences, reward_model
 from onedemo.baselines.comparer import Comparer, ComparisonBudgetSpent, agreement
@@ -17,10 +16,11 @@ from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, dr
 from onedemo.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
 from onedemo.errors import UserError
 from onedemo.hidden import load_hidden
-from onedemo.motion import backflip_reward
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.records import Segment
 from onedemo.rollouts import Collector
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import backflip_reward
 
 QUICK = RewardConfig(updates=150)
 
@@ -70,7 +70,7 @@ def fitted():
 def batch():
     """Two staggered lanes of an untrained policy; each passes the end of an episode of 100 steps."""
     policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=100, seed=0)
-    env = envs.make("hopper", 2, horizon=100, nthread=0)
+    env = vector_env.make("hopper", 2, horizon=100, nthread=0)
     return Collector(env, seed=0).collect(policy.snapshot(), 160)
 
 

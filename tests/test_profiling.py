@@ -3,12 +3,12 @@
 import mujoco
 import numpy as np
 
-from onedemo import envs, profiling
-from onedemo.physics import load_model
+from onedemo.sim import physics_profiling, vector_env
+from onedemo.sim.physics import load_model
 
 
 def stepped():
-    model = load_model(envs.SPECS["hopper"].xml)
+    model = load_model(vector_env.SPECS["hopper"].xml)
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.5, -0.3, 0.2
     mujoco.mj_step(model, data, 200)
@@ -16,11 +16,11 @@ def stepped():
 
 
 def test_off_unless_asked_for_and_it_changes_no_bit():
-    callback, shipped = profiling._global()
+    callback, shipped = physics_profiling._global()
     assert callback is not None and shipped, "MuJoCo keeps its clock elsewhere: physics is a fifth slower"
     assert callback.value is None
     quick = stepped()
-    with profiling.as_shipped():
+    with physics_profiling.as_shipped():
         assert callback.value == shipped
         slow = stepped()
     assert callback.value is None
@@ -28,7 +28,7 @@ def test_off_unless_asked_for_and_it_changes_no_bit():
 
 
 def test_without_the_global_nothing_changes(monkeypatch):
-    monkeypatch.setattr(profiling, "_global", lambda: (None, None))
-    profiling.switch_off()
-    with profiling.as_shipped():
+    monkeypatch.setattr(physics_profiling, "_global", lambda: (None, None))
+    physics_profiling.switch_off()
+    with physics_profiling.as_shipped():
         assert np.isfinite(stepped()).all()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from onedemo.envs import observe, spec
 from onedemo.errors import UserError
 from onedemo.headless import train
 from onedemo.hidden import HiddenStates
 from onedemo.raters import Oracle, RatingBudgetSpent, appearance, make_rater
 from onedemo.records import Demo, Segment
+from onedemo.sim.vector_env import observe, spec
 from onedemo.storage.store import Store
 
 

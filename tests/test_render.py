@@ -241,7 +241,7 @@ def test_close_ends_the_job_in_hand_and_cancels_the_rest():
 # --- machines that cannot draw --------------------------------------------------------------------
 
 _DRAW = """
-import onedemo.envs, mujoco
+import onedemo.sim.vector_env, mujoco
 from onedemo.errors import UserError
 from onedemo.render import Renderer, RenderThread
 mujoco.MjModel.from_xml_string("<mujoco/>")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import envs
 from onedemo.errors import UserError
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector, EpisodeRules, Starts, evaluate
+from onedemo.sim import vector_env
 
 HORIZON = 40
 
@@ -22,7 +22,7 @@ def policy(seed=0, horizon=HORIZON):
 
 
 def collector(lanes=4, seed=0, **options):
-    env = envs.make("hopper", lanes, horizon=HORIZON, nthread=0)
+    env = vector_env.make("hopper", lanes, horizon=HORIZON, nthread=0)
     return Collector(env, seed=seed, **options)
 
 
@@ -64,7 +64,7 @@ def test_each_step_follows_from_the_one_before():
     assert np.abs(starts - [0, 1.25, 0, 0, 0, 0]).max() <= 0.005
     np.testing.assert_array_equal(batch.next_inputs, snapshot.inputs(batch.next_obs, batch.next_clock))
     # The same actions in a fresh environment give the same states and rewards.
-    env = envs.make("hopper", 4, horizon=HORIZON, nthread=0)
+    env = vector_env.make("hopper", 4, horizon=HORIZON, nthread=0)
     env.reset(seed=0)
     for t in range(HORIZON):
         np.testing.assert_array_equal(env.qpos, batch.qpos[:, t])
@@ -162,7 +162,7 @@ def test_evaluate_gives_whole_episodes():
     assert episodes.qpos.shape == episodes.qvel.shape == (3, HORIZON + 1, 6)
     np.testing.assert_array_equal(episodes.clock, np.tile(np.arange(HORIZON + 1), (3, 1)))
     np.testing.assert_array_equal(
-        episodes.obs, envs.observe(envs.spec("hopper"), episodes.qpos, episodes.qvel)
+        episodes.obs, vector_env.observe(vector_env.spec("hopper"), episodes.qpos, episodes.qvel)
     )
     means = snapshot.act(snapshot.inputs(episodes.obs[:, :-1], episodes.clock[:, :-1]))
     np.testing.assert_allclose(episodes.actions, means, atol=1e-5)

@@ -10,10 +10,10 @@ import onedemo
 from onedemo.demos import import_video
 from onedemo.errors import UserError
 from onedemo.learner import Learner
-from onedemo.motion import CONTACT_MARGIN, clearances
 from onedemo.raters import make_rater
 from onedemo.records import Demo, Segment
 from onedemo.scripted import Script, load_marks, marked, table_path, visible
+from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
 
 TABLE = Path(onedemo.__file__).parent / "bench" / "person_backflip.json"
 VIDEO = Path(__file__).parents[2] / "shared" / "videos" / "person_backflip_480.mp4"

@@ -7,7 +7,6 @@ from test_loop import by_rule, make_trainer
 from test_predictor import world
 from worlds import FRAMES, falling_demo, small_config
 
-from onedemo import body
 from onedemo.app.cli import main
 from onedemo.appearance import Track
 from onedemo.asking import Simulated
@@ -18,6 +17,7 @@ from onedemo.loop import Trainer
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.records import Segment
 from onedemo.runs import add_run
+from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment, Store
 from onedemo.transfer import newest_snapshot
 
@@ -122,7 +122,9 @@ def poses(count, seed, matters):
         visual=np.zeros((FRAMES, 1), np.float32),
         basis=np.ones((FRAMES, 1), np.float32),
         fps=30.0,
-        track=Track(pose=body.pose(shown).astype(np.float32), motion=body.motion(shown).astype(np.float32)),
+        track=Track(
+            pose=kinematics.pose(shown).astype(np.float32), motion=kinematics.motion(shown).astype(np.float32)
+        ),
     )
     ratings = []
     for event in range(count):

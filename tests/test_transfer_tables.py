@@ -14,7 +14,7 @@ from onedemo.bench.transfer_table import BACK, THERE
 from onedemo.demos import find_demo
 from onedemo.errors import UserError
 from onedemo.hidden import hidden_path, load_hidden
-from onedemo.motion import farthest_turn, net_turns, turned
+from onedemo.sim.task_rewards import farthest_turn, net_turns, turned
 
 SEED = 101  # not one of those that are reported
 

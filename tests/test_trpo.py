@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.nn.utils import parameters_to_vector
 
-from onedemo import envs
 from onedemo.fisher import conjugate_gradient, fisher_product, mean_kl
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.records import Rollouts
 from onedemo.rollouts import Collector
+from onedemo.sim import vector_env
 from onedemo.trpo import Trpo, TrpoConfig, gae
 
 
@@ -264,7 +264,7 @@ def test_value_function_bootstraps_through_the_time_limit():
 
 
 def hopper(seed, rounds, lanes=16, steps=250):
-    env = envs.make("hopper", lanes, nthread=0, terminate_when_unhealthy=True)
+    env = vector_env.make("hopper", lanes, nthread=0, terminate_when_unhealthy=True)
     policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=1000, seed=seed)
     trpo = Trpo(policy, TrpoConfig(), seed=seed)
     collector = Collector(env, seed=seed)

@@ -1,6 +1,6 @@
 """MuJoCo Warp against the physics on the processor, on Warp's processor device: no GPU is needed.
 
-Kernels are compiled on the first run (about 20 s) and cached. Tolerances: ``trainer/warp.py``.
+Kernels are compiled on the first run (about 20 s) and cached. Tolerances: ``trainer/sim/warp_physics.py``.
 """
 
 import sys
@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from onedemo import envs
 from onedemo.bench.figures import Skipped
 from onedemo.config import load_config
 from onedemo.errors import UserError
 from onedemo.learner import Learner
-from onedemo.physics import RolloutPhysics, load_model
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector
+from onedemo.sim import vector_env
+from onedemo.sim.physics import RolloutPhysics, load_model
 from onedemo.trpo import Trpo, TrpoConfig
 
 pytest.importorskip("mujoco_warp", reason="the extra 'warp' is not installed: pip install 'onedemo[warp]'")
@@ -28,7 +28,7 @@ POSITIONS, VELOCITIES = 5e-6, 5e-5
 
 
 def make(lanes=LANES, **options):
-    return envs.make("hopper", lanes, physics="warp", **options)
+    return vector_env.make("hopper", lanes, physics="warp", **options)
 
 
 def actions_for(seed, lanes, steps):
@@ -46,7 +46,7 @@ def states():
     qpos[:third, 1] += rng.uniform(0.2, 1, third)
     qpos[:third, 2] = rng.uniform(-3, 3, third)
     qvel[:third] += rng.normal(0, 3, (third, 6))
-    env = envs.make("hopper", LANES, nthread=0)
+    env = vector_env.make("hopper", LANES, nthread=0)
     env.set_states(np.arange(LANES), qpos, qvel)
     for action in actions_for(2, LANES, 300):
         env.step(action)
@@ -76,7 +76,7 @@ def apart(ours, theirs):
 
 def own_jump(qpos, qvel, action):
     """How far the processor's velocities after one step scatter when the state is moved by rounding."""
-    model = load_model(envs.SPECS["hopper"].xml)
+    model = load_model(vector_env.SPECS["hopper"].xml)
     physics = RolloutPhysics(model, 4, 200, 0)
     state = np.tile(np.concatenate([[0], qpos, qvel]), (200, 1))
     state[1:, 1:] += np.random.default_rng(0).normal(0, 5e-7, (199, 12))
@@ -87,7 +87,7 @@ def own_jump(qpos, qvel, action):
 
 def test_each_step_agrees_with_the_processor(ours, states):
     """Every lane within tolerance, unless a contact sets in or not: the processor's answer jumps too."""
-    theirs = started(envs.make("hopper", LANES, nthread=0), states)
+    theirs = started(vector_env.make("hopper", LANES, nthread=0), states)
     beyond = 0
     for action in actions_for(3, LANES, 60):
         before = theirs.qpos, theirs.qvel
@@ -106,7 +106,7 @@ def test_each_step_agrees_with_the_processor(ours, states):
 
 
 def test_trajectories_agree_as_long_as_chaos_lets_them(ours, states):
-    theirs = started(envs.make("hopper", LANES, nthread=0), states)
+    theirs = started(vector_env.make("hopper", LANES, nthread=0), states)
     started(ours, states)
     seen = {}
     for step, action in enumerate(actions_for(4, LANES, 100), start=1):
@@ -137,7 +137,7 @@ def test_a_lane_depends_on_its_own_state_alone(ours, states):
 
 
 def test_episodes_end_and_begin_as_on_the_processor():
-    ours, theirs = make(8, horizon=10), envs.make("hopper", 8, horizon=10, nthread=0)
+    ours, theirs = make(8, horizon=10), vector_env.make("hopper", 8, horizon=10, nthread=0)
     for env in (ours, theirs):
         env.reset(seed=3, options={"stagger": True})
     np.testing.assert_array_equal(ours.qpos, theirs.qpos)
@@ -195,34 +195,34 @@ def test_a_run_can_be_set_to_it():
 
 @pytest.mark.parametrize("room", [(1, 41), (14, 12)])
 def test_contacts_without_room_are_an_error(room, monkeypatch):
-    from onedemo import warp
+    from onedemo.sim import warp_physics
 
     lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
-    model = load_model(envs.SPECS["hopper"].xml)
+    model = load_model(vector_env.SPECS["hopper"].xml)
     states = np.concatenate([np.zeros((4, 1)), lying, np.zeros((4, 6))], axis=1)
-    warp.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
-    monkeypatch.setattr(warp, "_room", lambda model, pairs: room)
+    warp_physics.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
+    monkeypatch.setattr(warp_physics, "_room", lambda model, pairs: room)
     with pytest.raises(RuntimeError, match=f"room for, {room[0]} a lane with {room[1]} constraints"):
-        warp.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
+        warp_physics.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
 
 
 def test_an_unknown_device_names_those_there_are():
-    from onedemo.warp import WarpPhysics
+    from onedemo.sim.warp_physics import WarpPhysics
 
     with pytest.raises(UserError, match=r"no device 'cuda:7' .* there are: cpu"):
-        WarpPhysics(load_model(envs.SPECS["hopper"].xml), 4, 1, device="cuda:7")
+        WarpPhysics(load_model(vector_env.SPECS["hopper"].xml), 4, 1, device="cuda:7")
 
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
-    monkeypatch.delitem(sys.modules, "onedemo.warp", raising=False)
+    monkeypatch.delitem(sys.modules, "onedemo.sim.warp_physics", raising=False)
     with pytest.raises(UserError, match=r"pip install 'onedemo\[warp\]'"):
         make(2)
 
 
 def test_an_unknown_physics_is_refused():
     with pytest.raises(ValueError, match="must be 'mujoco' or 'warp', got 'wrap'"):
-        envs.make("hopper", 2, physics="wrap")
+        vector_env.make("hopper", 2, physics="wrap")
 
 
 def test_the_bench_counts_steps_of_both():
@@ -233,6 +233,6 @@ def test_the_bench_counts_steps_of_both():
     assert all(len(line) == 2 and min(line) > 10 for line in taken.y.values())
     import warp
 
-    if not warp.is_cuda_available():
+    if not warp_physics.is_cuda_available():
         (skipped,) = measure(quick=True)
         assert isinstance(skipped, Skipped) and "no CUDA device" in skipped.reason

@@ -10,13 +10,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from onedemo import body, envs
 from onedemo.appearance import Track
 from onedemo.config import load_config
 from onedemo.hidden import HiddenStates, hidden_path, save_hidden
-from onedemo.motion import joint_points
 from onedemo.records import Demo
 from onedemo.render import Renderer
+from onedemo.sim import kinematics, vector_env
+from onedemo.sim.task_rewards import joint_points
 from onedemo.video import write_webm
 
 STEPS = 250
@@ -54,13 +54,15 @@ def drawn_demo(directory: Path, seed: int = 0) -> Demo:
 def falling_track(seed: int = 0) -> Track:
     """What a perfect eye would see in the demo."""
     obs = falling_states(seed).obs[FRAME_STEPS]
-    return Track(pose=body.pose(obs).astype(np.float32), motion=body.motion(obs).astype(np.float32))
+    return Track(
+        pose=kinematics.pose(obs).astype(np.float32), motion=kinematics.motion(obs).astype(np.float32)
+    )
 
 
 @functools.cache
 def falling_states(seed: int = 0) -> HiddenStates:
     """The states of the fall, STEPS + 1 of them."""
-    env = envs.make("hopper", 1, horizon=STEPS + 1, nthread=0)
+    env = vector_env.make("hopper", 1, horizon=STEPS + 1, nthread=0)
     obs, _ = env.reset(seed=seed)
     states = [(obs[0], env.qpos[0], env.qvel[0])]
     actions = 0.8 * np.sin(np.arange(STEPS)[:, None] / 20 + np.array([0.0, 1.0, 2.0]))

@@ -5,7 +5,7 @@ network regresses the pose from the features. It then says what pose a demo of t
 in each frame. Of a demo of another body it says nothing. It depends on robot and encoder alone, so it
 is learned once and kept.
 
-Shapes: n pictures, F demo frames, D frame features, P = 9 numbers of a pose (``trainer/body.py``).
+Shapes: n pictures, F demo frames, D frame features, P = 9 numbers of a pose (``trainer/sim/kinematics.py``).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from onedemo import body, envs
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.encoders import Encoder
 from onedemo.render import RenderThread
+from onedemo.sim import kinematics, vector_env
 from onedemo.starts import wild_rollouts
 
 PICTURES = 4000
@@ -95,11 +95,13 @@ class Appearance:
             fps: Frames per second.
         """
         poses = self.poses(features)
-        height = _smooth(poses[:, 0] / body.HEIGHT_SCALE)
+        height = _smooth(poses[:, 0] / kinematics.HEIGHT_SCALE)
         waves = poses[:, 1:].reshape(len(poses), -1, 2)
         angles = _smooth(np.unwrap(np.arctan2(waves[..., 0], waves[..., 1]), axis=0))
-        motion = body.motion_of(_rate(height, fps), angles, _rate(angles, fps))
-        return Track(pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32))
+        motion = kinematics.motion_of(_rate(height, fps), angles, _rate(angles, fps))
+        return Track(
+            pose=kinematics.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32)
+        )
 
 
 def _go_on() -> None:
@@ -118,7 +120,7 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], 
     Raises:
         UserError: If this machine cannot draw.
     """
-    spec = envs.spec(env_name)
+    spec = vector_env.spec(env_name)
     model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
     path = cache_dir / f"{env_name}-{model}-{encoder.name}-v{_VERSION}.npz"
     if (data := read_whole(path)) is not None:
@@ -157,7 +159,7 @@ def pictures(
                 yield drawing.render(q[None]).result()[0]
 
         features = encoder.encode(drawn())
-    return features, body.pose(qpos[:, 1:]).astype(np.float32)
+    return features, kinematics.pose(qpos[:, 1:]).astype(np.float32)
 
 
 def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> Appearance:
@@ -215,7 +217,7 @@ def _network(features: int) -> nn.Sequential:
     layer = nn.utils.skip_init
     return nn.Sequential(
         layer(nn.Linear, features, 256), nn.ReLU(), layer(nn.Linear, 256, 128), nn.ReLU(),
-        layer(nn.Linear, 128, body.POSE),
+        layer(nn.Linear, 128, kinematics.POSE),
     )  # fmt: skip
 
 

@@ -113,7 +113,7 @@ class RunConfig:
     seed: int = 0
     """Of every random number in the run."""
     env: str = "hopper"
-    """The robot: a name in the registry of ``trainer/envs.py``."""
+    """The robot: a name in the registry of ``trainer/sim/vector_env.py``."""
     device: str = "cpu"
     """Where predictor and policy compute: "cpu", "cuda" or "cuda:N"."""
     encoder: str = "efficientnet-lite0"

@@ -9,10 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.alignment import align
 from onedemo.learner import Learner
-from onedemo.motion import (
+from onedemo.policy import PolicySnapshot
+from onedemo.predictor import Snapshot
+from onedemo.raters import Oracle, appearance
+from onedemo.rollouts import EpisodeRules, Episodes, evaluate
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import (
     backflip_reward,
     clean_turns,
     farthest_turn,
@@ -22,10 +26,6 @@ from onedemo.motion import (
     turned,
     until_fall,
 )
-from onedemo.policy import PolicySnapshot
-from onedemo.predictor import Snapshot
-from onedemo.raters import Oracle, appearance
-from onedemo.rollouts import EpisodeRules, Episodes, evaluate
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6
@@ -97,14 +97,14 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``state_error``: mean squared error of its states (``state_errors``), mean over time.
         - ``backflip_reward``, with the actions clipped to what the motors do, and
           ``backflip_reward_raw_actions``.
-        - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.motion``.
-        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``onedemo.motion``.
+        - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.sim.task_rewards``.
+        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``onedemo.sim.task_rewards``.
         - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
         - ``hop_reward``: the same rewards over the whole episode, falls or not.
         - ``upright_seconds``: until then.
     """
     qpos, qvel, actions = episodes.qpos, episodes.qvel, episodes.actions
-    dt = envs.spec("hopper").dt
+    dt = vector_env.spec("hopper").dt
     upright = until_fall(qpos[:, 1:], qvel[:, 1:])
     hops = hop_reward(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:], actions)
     return {
@@ -156,7 +156,7 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     demo = appearance(oracle.hidden.qpos[every], oracle.hidden.qvel[every])
     robot = appearance(qpos[:, every], qvel[:, every])
     distances = np.stack([np.linalg.norm(demo[:, None] - episode, axis=-1) for episode in robot])
-    band = round(ALIGN_SECONDS / (_EVERY * envs.spec("hopper").dt))
+    band = round(ALIGN_SECONDS / (_EVERY * vector_env.spec("hopper").dt))
     path = align(distances, band)
     return oracle.rating_of(np.take_along_axis(distances, path[..., None], axis=-1)[..., 0]).mean(axis=-1)
 

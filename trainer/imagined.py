@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from onedemo import body
 from onedemo.predictor import visual_inputs
+from onedemo.sim import kinematics
 
 _DIMS = 8
 """Principal components of the frame features that say how alike two frames look."""
@@ -69,7 +69,7 @@ def track_of(basis: torch.Tensor, weights: torch.Tensor, fps: float) -> torch.Te
     frames = torch.arange(len(poses))
     before, after = (frames - _AROUND).clamp(min=0), (frames + _AROUND).clamp(max=len(poses) - 1)
     seconds = ((after - before).clamp(min=1) / fps)[:, None]
-    return torch.cat([poses, body.MOTION_SCALE * (poses[after] - poses[before]) / seconds], dim=1)
+    return torch.cat([poses, kinematics.MOTION_SCALE * (poses[after] - poses[before]) / seconds], dim=1)
 
 
 def _gaussian(points: np.ndarray) -> np.ndarray:

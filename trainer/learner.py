@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from onedemo import body, envs
 from onedemo.appearance import Track
 from onedemo.choice import Question, choose
 from onedemo.config import RunConfig
@@ -25,6 +24,7 @@ from onedemo.practice import PracticeRules, fill_bank
 from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.records import Rollouts, Segment
 from onedemo.rollouts import Collector, EpisodeRules, Transitions
+from onedemo.sim import kinematics, vector_env
 from onedemo.starts import wild_rollouts
 from onedemo.storage.store import RatedSegment
 from onedemo.timing import frame_of_step
@@ -38,7 +38,7 @@ _AHEAD_SECONDS = (0.0, 0.13, 0.33)
 """The policy sees the demo as it is now and so far ahead (policy.kind = "table")."""
 _JUDGED_EVERY = 4
 """Control steps between those that are looked at to choose a clip."""
-_TABLE_DIMS = 2 * body.POSE
+_TABLE_DIMS = 2 * kinematics.POSE
 """Numbers of each of them: pose and motion where they are known, else principal components."""
 _DEVICE_LANES = 1024
 """From so many lanes on an accelerator acts itself; with fewer the way there and back costs more."""
@@ -59,7 +59,7 @@ class Learner:
     """
 
     def __init__(self, config: RunConfig, frames: int, fps: float, start: Snapshot | None = None) -> None:
-        spec = envs.spec(config.env)
+        spec = vector_env.spec(config.env)
         check_device(config.device)
         self.config = config
         self.dt = spec.dt
@@ -277,7 +277,7 @@ class Learner:
         return self._wild
 
     def _make_policy(self) -> Policy:
-        spec, config = envs.spec(self.config.env), self.config.policy
+        spec, config = vector_env.spec(self.config.env), self.config.policy
         table = None
         if config.kind == "table":  # filled in ``look_at``
             table = np.zeros((self.demo_steps, len(_AHEAD_SECONDS) * _TABLE_DIMS))
@@ -296,7 +296,7 @@ class Learner:
         self, lanes: int, *, seed: int, stagger: bool, rules: EpisodeRules | None = None
     ) -> Collector:
         rollouts = self.config.rollouts
-        env = envs.make(
+        env = vector_env.make(
             self.config.env,
             lanes,
             horizon=self.demo_steps,
@@ -330,7 +330,7 @@ def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:
     Raises:
         UserError: If the robot is unknown or the demo is shorter than a clip.
     """
-    dt = envs.spec(config.env).dt
+    dt = vector_env.spec(config.env).dt
     demo, clip = int(frames / fps / dt + 1e-6), int(config.ratings.clip_seconds / dt + 0.5)
     if demo < clip:
         raise UserError(

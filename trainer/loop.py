@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from onedemo import envs, gallery
+from onedemo import gallery
 from onedemo.appearance import Track
 from onedemo.appearance import learn as learn_appearance
 from onedemo.asking import Asking, Simulated
@@ -32,13 +32,14 @@ from onedemo.demos import read_frames
 from onedemo.encoders import Encoder, demo_features
 from onedemo.errors import in_words
 from onedemo.learner import Learner
-from onedemo.motion import TASK_REWARDS
 from onedemo.pairing import Pairing
 from onedemo.policy import PolicySnapshot
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render import RenderThread
 from onedemo.rollouts import Acting, EpisodeRules, Transitions
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.store import Store
 from onedemo.training_set import TrainingSet
 from onedemo.transfer import keep_start, snapshot_file
@@ -176,7 +177,7 @@ class Trainer:
     @property
     def dt(self) -> float:
         """Seconds of a control step."""
-        return envs.spec(self.config.env).dt
+        return vector_env.spec(self.config.env).dt
 
     def clip_file(self, clip_id: int) -> Path:
         """The picture of a clip, all its frames; it is there once the clip is "ready"."""

@@ -29,10 +29,10 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from onedemo import body
 from onedemo.imagined import track_of
 from onedemo.marks import marked_steps
 from onedemo.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment
 
 _UPDATES = 300
@@ -45,7 +45,7 @@ _SPREAD = 0.3
 """Of the weights of an imagined track to begin with."""
 _RIDGE = 0.004
 """Of the penalty on them, a standard normal prior for about 125 ratings."""
-_PRIOR = np.repeat([-1.0, -2.0], body.POSE)
+_PRIOR = np.repeat([-1.0, -2.0], kinematics.POSE)
 """Log weights before any rating: a difference in pose counts more than one in motion."""
 _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
@@ -216,7 +216,7 @@ def _fit_one(
         track = torch.from_numpy(_seen(view))
         squares = (track[clips.frames] - clips.robot).square()
     else:
-        places = _SPREAD * torch.randn(basis.shape[1], body.POSE, generator=generator)
+        places = _SPREAD * torch.randn(basis.shape[1], kinematics.POSE, generator=generator)
         parameters.append(places.requires_grad_())
     optimiser = torch.optim.Adam(parameters, _RATE, fused=True)
     schedule = None
@@ -271,4 +271,4 @@ def _ascending(first: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:
 
 
 def _body(obs: np.ndarray) -> np.ndarray:
-    return np.concatenate([body.pose(obs), body.motion(obs)], axis=-1).astype(np.float32)
+    return np.concatenate([kinematics.pose(obs), kinematics.motion(obs)], axis=-1).astype(np.float32)

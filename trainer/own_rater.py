@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.clips import fit
 from onedemo.demos import read_frames
 from onedemo.errors import UserError
 from onedemo.judge import Budget
 from onedemo.records import Demo, Segment
+from onedemo.sim import vector_env
 from onedemo.timing import frame_of_step
 
 
@@ -53,7 +53,7 @@ class OwnRater(Budget):
         super().__init__(budget, given)
         self.name = name
         self._rate = _find(name)
-        self._demo, self._dt = demo, envs.spec("hopper").dt
+        self._demo, self._dt = demo, vector_env.spec("hopper").dt
         self._frames: np.ndarray | None = None
         self._renderer: Any = None
 

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from onedemo import envs
 from onedemo.policy import PolicySnapshot
 from onedemo.records import Rollouts
+from onedemo.sim import vector_env
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -146,7 +146,7 @@ class Collector:
 
     def __init__(
         self,
-        env: envs.HopperVectorEnv,
+        env: vector_env.HopperVectorEnv,
         *,
         seed: int,
         rules: EpisodeRules | None = None,
@@ -297,7 +297,7 @@ class Acting:
     """Move the demo's clock; their starts and stops are not used."""
 
     def step(
-        self, env: envs.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray, elapsed: int,
+        self, env: vector_env.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray, elapsed: int,
         rng: np.random.Generator | None = None,
     ) -> tuple[Step, np.ndarray, np.ndarray]:  # fmt: skip
         """One control step of all lanes, none of which may end with it.
@@ -360,7 +360,7 @@ def evaluate(
     horizon = policy.horizon if horizon is None else horizon
     acting = Acting(policy=policy, rules=rules or EpisodeRules())
     # One step more than asked, so that the last state is seen before the restart.
-    env = envs.make(env_name, episodes, horizon=horizon + 1, nthread=nthread)
+    env = vector_env.make(env_name, episodes, horizon=horizon + 1, nthread=nthread)
     rng = None if deterministic else np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
     obs, _ = env.reset(seed=seed)
     clock = np.zeros(episodes, np.int32)

@@ -20,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.errors import UserError
 from onedemo.judge import Judge
-from onedemo.motion import CONTACT_MARGIN, clearances
 from onedemo.rater_errors import Errors
 from onedemo.records import Demo
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
 
 SUFFIX = ".script.json"
 THRESHOLDS = (0.6, 0.9, 1.35, 1.9)
@@ -63,7 +63,7 @@ class Script(Judge):
     ) -> None:
         super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
         self._marks = marks
-        self._dt = envs.spec("hopper").dt
+        self._dt = vector_env.spec("hopper").dt
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance step by step, (W,), from the marks from control step ``demo_step`` on."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo import envs
-from onedemo.motion import clearances
 from onedemo.rollouts import Collector, EpisodeRules, Starts, Transitions
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import clearances
 
 _JOINTS = np.array([[-2.6, 0.05], [-2.6, 0.05], [-0.78, 0.78]])
 """Range of thigh, leg and foot, radians: that of the model's joints (hopper.xml), whose stops are soft."""
@@ -116,7 +116,7 @@ def wild_rollouts(
     Returns:
         The rollouts; ``clock`` counts from each random start.
     """
-    env = envs.make(env_name, lanes, horizon=every, nthread=nthread)
+    env = vector_env.make(env_name, lanes, horizon=every, nthread=nthread)
     collector = Collector(env, seed=seed, rules=RandomStarts(standing), stagger=False)
     rollouts = collector.collect(HeldNoise(lanes), steps)
     env.close()

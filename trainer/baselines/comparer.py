@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.motion import backflip_reward
 from onedemo.records import Segment
 from onedemo.rollouts import Transitions
+from onedemo.sim.task_rewards import backflip_reward
 
 
 class ComparisonBudgetSpent(Exception):

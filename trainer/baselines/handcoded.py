@@ -16,14 +16,14 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from onedemo import envs
 from onedemo.baselines.scores import Score, judge, save_training
 from onedemo.core.cpu import cores
 from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates
-from onedemo.motion import TASK_REWARDS
 from onedemo.policy import Policy, PolicyConfig, check_device
 from onedemo.rollouts import Collector, evaluate
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.trpo import Trpo, TrpoConfig
 
 
@@ -96,7 +96,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     check_device(config.device)
     torch.set_num_threads(1)  # these networks are too small to gain from more
     # Hopping is learned as in Hopper-v5, where a fall ends the episode; a flip is no fall.
-    env = envs.make(
+    env = vector_env.make(
         "hopper",
         config.lanes,
         horizon=config.horizon,

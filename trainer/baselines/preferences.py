@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from onedemo import envs
 from onedemo.baselines.comparer import Comparer, agreement
 from onedemo.baselines.reward_model import (
     Comparison,
@@ -41,6 +40,7 @@ from onedemo.errors import UserError
 from onedemo.hidden import HiddenStates
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector, Transitions, evaluate
+from onedemo.sim import vector_env
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.store import Store
 from onedemo.trpo import Trpo, TrpoConfig
@@ -105,7 +105,7 @@ class PreferencesConfig:
     @property
     def segment_steps(self) -> int:
         """W."""
-        return int(self.segment_seconds / envs.spec("hopper").dt + 0.5)
+        return int(self.segment_seconds / vector_env.spec("hopper").dt + 0.5)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -280,12 +280,12 @@ def draw_pairs(rollouts: Transitions, count: int, length: int, rng: np.random.Ge
     return [(first, second) for first, second in segment]
 
 
-def _make_env(config: PreferencesConfig) -> envs.HopperVectorEnv:
-    return envs.make("hopper", config.lanes, horizon=config.horizon, nthread=config.threads)
+def _make_env(config: PreferencesConfig) -> vector_env.HopperVectorEnv:
+    return vector_env.make("hopper", config.lanes, horizon=config.horizon, nthread=config.threads)
 
 
 def _untrained(config: PreferencesConfig) -> Policy:
-    spec = envs.spec("hopper")
+    spec = vector_env.spec("hopper")
     return Policy(
         config.policy,
         obs_size=spec.obs_size,

@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from onedemo import envs
 from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
-from onedemo.motion import clean_turns, net_turns, task_reward, until_fall
 from onedemo.policy import Policy
 from onedemo.rollouts import Episodes
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import clean_turns, net_turns, task_reward, until_fall
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -62,7 +62,7 @@ def judge(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple
         reward_max=float(totals_N.max()),
         net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
         clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
-        upright_seconds=float(upright_NT.sum(1).mean() * envs.spec("hopper").dt),
+        upright_seconds=float(upright_NT.sum(1).mean() * vector_env.spec("hopper").dt),
     )
     lane = int(totals_N.argmax())
     episode = HiddenStates(

@@ -22,10 +22,17 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from onedemo import envs
 from onedemo.errors import UserError
 from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
-from onedemo.motion import backflip_reward, clean_turns, clearances, fallen, joint_points, net_turns
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import (
+    backflip_reward,
+    clean_turns,
+    clearances,
+    fallen,
+    joint_points,
+    net_turns,
+)
 
 GRAVITY = 9.81
 STANDING = 1.2
@@ -94,7 +101,7 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
         The episode, from the standard reset.
     """
     ahead = plan.knots * plan.hold
-    env = envs.make("hopper", plan.samples, horizon=ahead + 1)
+    env = vector_env.make("hopper", plan.samples, horizon=ahead + 1)
     env.reset(seed=plan.seed)
     rng = np.random.default_rng(plan.seed)
     steps = round(plan.seconds / env.dt)
@@ -122,7 +129,7 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
     env.close()
     states = np.array(qpos), np.array(qvel)
     return HiddenStates(
-        obs=envs.observe(env.env_spec, *states),
+        obs=vector_env.observe(env.env_spec, *states),
         actions=np.array(actions, np.float32),
         qpos=states[0],
         qvel=states[1],
@@ -210,7 +217,7 @@ def _last_choice(plan: FlipPlan, commands: int, dt: float) -> int:
 
 def _search(
     plan: FlipPlan,
-    env: envs.HopperVectorEnv,
+    env: vector_env.HopperVectorEnv,
     qpos_q: np.ndarray,
     qvel_v: np.ndarray,
     step: int,
@@ -243,7 +250,7 @@ def _search(
 
 def _simulate(
     plan: FlipPlan,
-    env: envs.HopperVectorEnv,
+    env: vector_env.HopperVectorEnv,
     qpos_q: np.ndarray,
     qvel_v: np.ndarray,
     plans_NKa: np.ndarray,

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from onedemo import body, envs
 from onedemo.appearance import Track
 from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
 from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
@@ -30,6 +29,7 @@ from onedemo.policy import Policy
 from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
 from onedemo.raters import Oracle, appearance
 from onedemo.records import Demo
+from onedemo.sim import kinematics, vector_env
 from onedemo.timing import steps_of_frames
 from onedemo.trpo import TrpoConfig
 
@@ -105,7 +105,9 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
     torch.set_num_threads(1)
     learner = Learner(config, demo.frames, demo.fps)
     shown = hidden.obs[_steps(demo, hidden)]
-    track = Track(pose=body.pose(shown).astype(np.float32), motion=body.motion(shown).astype(np.float32))
+    track = Track(
+        pose=kinematics.pose(shown).astype(np.float32), motion=kinematics.motion(shown).astype(np.float32)
+    )
     learner.look_at(track.pose, track)
     snapshot = TrueRating(demo, hidden)
     watch = Watch(hidden, config.rollouts.total_steps)
@@ -168,7 +170,7 @@ def _baseline(demo: Demo, policy: Policy, curve: Sequence[Score]) -> dict[str, A
 
 def _steps(demo: Demo, hidden: HiddenStates) -> np.ndarray:
     """Control step that each frame shows."""
-    steps = steps_of_frames(demo.frames, envs.spec("hopper").dt, demo.fps)
+    steps = steps_of_frames(demo.frames, vector_env.spec("hopper").dt, demo.fps)
     return np.minimum(steps, len(hidden.qpos) - 1)
 
 

@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.appearance import learn as learn_appearance
 from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
@@ -38,6 +37,7 @@ from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle
 from onedemo.records import Demo
 from onedemo.rollouts import Episodes
+from onedemo.sim import vector_env
 from onedemo.storage.store import Store
 from onedemo.timing import steps_of_frames
 
@@ -222,7 +222,7 @@ def outcome(
     """
     alike = values.get("aligned_similarity")
     best = int(np.argmax(alike if alike is not None else values["net_turns"]))  # type: ignore[arg-type]
-    steps = steps_of_frames(demo.frames, envs.spec("hopper").dt, demo.fps)
+    steps = steps_of_frames(demo.frames, vector_env.spec("hopper").dt, demo.fps)
     steps = np.minimum(steps, episodes.qpos.shape[1] - 1)
     return {
         "figures": {name: _figure(name, each) for name, each in values.items()},
@@ -244,7 +244,7 @@ def _errors(episodes: Episodes, oracle: Oracle | None, best: int) -> dict[str, S
     errors = state_errors(episodes.obs, oracle.hidden.obs)
     points = errors.shape[1] // _ERROR_EVERY
     errors = errors[:, : points * _ERROR_EVERY].reshape(len(errors), points, _ERROR_EVERY).mean(axis=-1)
-    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * envs.spec("hopper").dt
+    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * vector_env.spec("hopper").dt
     figures = {"seconds": seconds, "best": errors[best], "mean": errors.mean(axis=0)}
     return {name: [round(float(x), 4) for x in values] for name, values in figures.items()}
 

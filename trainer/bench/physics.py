@@ -15,15 +15,15 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from onedemo import envs, profiling
 from onedemo.bench.figures import Growth, Result, Skipped, by_turns, ratio
 from onedemo.core.cpu import cores
-from onedemo.physics import load_model
+from onedemo.sim import physics_profiling, vector_env
+from onedemo.sim.physics import load_model
 
 LANES = 64
 MISSING = "{} is not installed: pip install -e '.[bench]'"
 """Why a comparison was skipped."""
-_SPEC = envs.SPECS["hopper"]
+_SPEC = vector_env.SPECS["hopper"]
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 
@@ -51,7 +51,7 @@ class Bare:
         Returns:
             Seconds.
         """
-        with profiling.as_shipped() if self._shipped else nullcontext():
+        with physics_profiling.as_shipped() if self._shipped else nullcontext():
             return self._run(states_NS, actions_TNa)
 
     def _run(self, states_NS: np.ndarray, actions_TNa: np.ndarray) -> float:
@@ -111,7 +111,7 @@ def _against_bare(turns: int, steps: int) -> list[Result]:
 
 
 def _ours_and_bare(lanes: int, steps: int, turns: int, *, shipped: bool = False) -> dict[str, list[float]]:
-    env, bare = envs.make("hopper", lanes, horizon=10**9), Bare(lanes, shipped=shipped)
+    env, bare = vector_env.make("hopper", lanes, horizon=10**9), Bare(lanes, shipped=shipped)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (steps, lanes, _SPEC.action_size))
@@ -145,7 +145,7 @@ def _against_envpool(turns: int, steps: int) -> list[Result]:
     except ImportError:
         return [Skipped(name="physics_vs_envpool", reason=MISSING.format("envpool"))]
     peer = envpool.make_gymnasium("Hopper-v4", num_envs=LANES, num_threads=cores(), seed=0)
-    env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
+    env = vector_env.make("hopper", LANES, terminate_when_unhealthy=True)
     env.reset(seed=0)
     peer.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, LANES, _SPEC.action_size))
@@ -177,16 +177,16 @@ def _against_gymnasium(turns: int, steps: int, quick: bool) -> list[Result]:
         )
     pilot = {name: _gymnasium_rate(make, steps, 2)[-1] for name, make in makers.items()}
     best = max(pilot, key=lambda name: pilot[name])
-    with profiling.as_shipped():  # processes that a peer starts now keep it
+    with physics_profiling.as_shipped():  # processes that a peer starts now keep it
         peer = makers[best]()
-    env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
+    env = vector_env.make("hopper", LANES, terminate_when_unhealthy=True)
     env.reset(seed=0)
     peer.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, LANES, _SPEC.action_size))
     long = np.random.default_rng(0).uniform(-1, 1, (steps, peer.num_envs, _SPEC.action_size))
 
     def theirs() -> float:
-        with profiling.as_shipped():
+        with physics_profiling.as_shipped():
             return _rate(peer.step, long)
 
     sides = {"ours": lambda: _rate(env.step, actions), "gymnasium": theirs}
@@ -208,12 +208,12 @@ def stock_hopper() -> gymnasium.Env:
     """Hopper-v5 as gymnasium has it."""
     # In a process of its own, importing this module has switched profiling off: as shipped, it is on.
     if multiprocessing.parent_process() is not None:
-        profiling.switch_on()
+        physics_profiling.switch_on()
     return gymnasium.make("Hopper-v5")
 
 
 def _gymnasium_rate(make: Callable[[], gymnasium.vector.VectorEnv], steps: int, turns: int) -> list[float]:
-    with profiling.as_shipped():
+    with physics_profiling.as_shipped():
         env = make()
         env.reset(seed=0)
         actions = np.random.default_rng(0).uniform(-1, 1, (steps, env.num_envs, _SPEC.action_size))

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.bench.predictor_scores import spearman
 from onedemo.choice import choose
 from onedemo.hidden import HiddenStates
@@ -22,6 +21,7 @@ from onedemo.practice import fill_bank
 from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle
 from onedemo.records import Rollouts, Segment
+from onedemo.sim import vector_env
 from onedemo.starts import HeldNoise
 
 STANDING, WILD, OTHERS, ATTEMPTS = "random, standing", "random starts", "other moves", "attempts"
@@ -136,7 +136,7 @@ class Exam:
         moments = list(zip(which, begin, strict=True))
         qpos, qvel = (np.stack([getattr(moves[i], n)[t] for i, t in moments]) for n in ("qpos", "qvel"))
         strength, noise = rng.uniform(size=(count, 1)), HeldNoise(count)
-        env = envs.make(learner.config.env, count, horizon=whole + 1, nthread=1)
+        env = vector_env.make(learner.config.env, count, horizon=whole + 1, nthread=1)
         env.reset(seed=self._seed)
         env.set_states(np.arange(count), qpos, qvel, elapsed=np.zeros(count, np.int32))
         rows = []

@@ -19,13 +19,13 @@ from stable_baselines3.common.vec_env import (  # pyright: ignore[reportMissingI
     VecEnv,
 )
 
-from onedemo import envs, profiling
 from onedemo.bench.figures import Result, by_turns, ratio
 from onedemo.bench.physics import stock_hopper
 from onedemo.bench.training import LANES, STEPS, one_thread
 from onedemo.core.cpu import cores
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector
+from onedemo.sim import physics_profiling, vector_env
 from onedemo.trpo import Trpo, TrpoConfig
 
 
@@ -133,7 +133,7 @@ class Theirs:
     ) -> None:
         # A last minibatch that is smaller than the others: ours has it, too.
         warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
-        self._profiling = profiling.as_shipped if shipped else nullcontext
+        self._profiling = physics_profiling.as_shipped if shipped else nullcontext
         with self._profiling():
             env = make()
         self._batch, self._threads = batch // env.num_envs * env.num_envs, threads
@@ -176,7 +176,7 @@ class OursAsVecEnv(VecEnv):
     """Our batched Hopper in sb3's interface: the stock reward, episodes that end at a fall."""
 
     def __init__(self, lanes: int) -> None:
-        self._env = envs.make("hopper", lanes, terminate_when_unhealthy=True)
+        self._env = vector_env.make("hopper", lanes, terminate_when_unhealthy=True)
         super().__init__(lanes, self._env.single_observation_space, self._env.single_action_space)
         self._actions = np.zeros((lanes, self._env.env_spec.action_size))
 
@@ -225,7 +225,7 @@ class _Ours:
     """Our TRPO on the stock reward, an iteration at a time."""
 
     def __init__(self, config: TrpoConfig) -> None:
-        self._env = envs.make("hopper", LANES, terminate_when_unhealthy=True)
+        self._env = vector_env.make("hopper", LANES, terminate_when_unhealthy=True)
         self._policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=1000, seed=0)
         self._trpo = Trpo(self._policy, config, seed=0, threads=cores())
         self._collector = Collector(self._env, seed=0)

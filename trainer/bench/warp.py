@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from onedemo import envs
 from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
 from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
 from onedemo.core.cpu import cores
-from onedemo.physics import Physics, RolloutPhysics, load_model
+from onedemo.sim import vector_env
+from onedemo.sim.physics import Physics, RolloutPhysics, load_model
 
 LANES = (512, 2048, 8192, 32768)
-_SPEC = envs.SPECS["hopper"]
+_SPEC = vector_env.SPECS["hopper"]
 _CORES = cores()
 
 
@@ -74,7 +74,7 @@ def growth(lanes: Sequence[int], *, device: str | None, turns: int, lane_steps: 
         turns: Repetitions of each side.
         lane_steps: Control steps of a repetition, all lanes together.
     """
-    from onedemo.warp import WarpPhysics
+    from onedemo.sim.warp_physics import WarpPhysics
 
     model = load_model(_SPEC.xml)
     rates: dict[str, list[float]] = {}

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from onedemo import profiling
+from onedemo.sim import physics_profiling
 
-profiling.switch_off()
+physics_profiling.switch_off()
 
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
@@ -101,7 +101,7 @@ def make_physics(kind: str, model: mujoco.MjModel, frame_skip: int, num_envs: in
     if kind == "mujoco":
         return RolloutPhysics(model, frame_skip, num_envs, nthread)
     if kind == "warp":
-        from onedemo.warp import WarpPhysics
+        from onedemo.sim.warp_physics import WarpPhysics
 
         return WarpPhysics(model, frame_skip, num_envs)
     raise ValueError(f"physics must be 'mujoco' or 'warp', got {kind!r}")

@@ -1,7 +1,7 @@
 """Batched MuJoCo environments behind ``gymnasium.vector.VectorEnv``, and the registry of them.
 
 All lanes are stepped by one call, into MuJoCo's C++ thread pool (``mujoco.rollout``) or into the
-optional ``trainer/warp.py``; nothing here loops over lanes in Python. A lane's whole physical state
+optional ``trainer/sim/warp_physics.py``; nothing here loops over lanes in Python. A lane's whole physical state
 is (time, qpos, qvel): the contact solver's warm start is cleared before each control step, so a
 state that was saved and put back goes on exactly as it would have.
 
@@ -22,7 +22,7 @@ from gymnasium.vector.utils import batch_space
 
 from onedemo.core.cpu import cores
 from onedemo.errors import UserError
-from onedemo.physics import load_model, make_physics
+from onedemo.sim.physics import load_model, make_physics
 
 _ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
@@ -174,7 +174,7 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         horizon: Control steps in an episode; the environment's own if None.
         nthread: Physics threads; as many as this process may use if None, none beside the
             caller's if 0. Of "mujoco" only.
-        physics: "mujoco", on the processor's cores, or "warp", on a GPU (``trainer/warp.py``).
+        physics: "mujoco", on the processor's cores, or "warp", on a GPU (``trainer/sim/warp_physics.py``).
         terminate_when_unhealthy: End an episode on a fall, as Hopper-v5 does (for baselines).
 
     Raises:

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from onedemo import envs
+from onedemo.sim import vector_env
 
 CONTACT_MARGIN = 0.002
 """Metres between a part and the ground at which MuJoCo's contact sets in: a part can lie on the
@@ -202,9 +202,9 @@ def hop_reward(
     Returns:
         Reward per step, (...).
     """
-    hopper = envs.spec("hopper")
+    hopper = vector_env.spec("hopper")
     forward = (next_qpos[..., 0] - qpos[..., 0]) / hopper.dt
-    upright = hopper.healthy_reward * envs.healthy(hopper, next_qpos, next_qvel)
+    upright = hopper.healthy_reward * vector_env.healthy(hopper, next_qpos, next_qvel)
     return forward + upright - hopper.control_cost * np.square(actions).sum(-1)
 
 
@@ -218,7 +218,7 @@ def until_fall(next_qpos: np.ndarray, next_qvel: np.ndarray) -> np.ndarray:
     Returns:
         True up to the first fall, (..., T). The stock return is the sum of the rewards there.
     """
-    upright = envs.healthy(envs.spec("hopper"), next_qpos, next_qvel)
+    upright = vector_env.healthy(vector_env.spec("hopper"), next_qpos, next_qvel)
     before = np.concatenate([np.ones_like(upright[..., :1]), upright[..., :-1]], axis=-1)
     return np.logical_and.accumulate(before, axis=-1)
 

@@ -1,0 +1,1 @@
+"""The simulated robot: batched MuJoCo environments, kinematics, hand-coded task rewards."""
