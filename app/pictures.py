@@ -12,9 +12,9 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from onedemo.clips import compose_clip
 from onedemo.demos import read_frames
 from onedemo.records import Demo
+from onedemo.render.clip_image import compose_clip
 from onedemo.storage.store import Store
 
 _JPEG_QUALITY = 88

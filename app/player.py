@@ -16,7 +16,7 @@ def player_html(
     """Canvases onto which a clip is drawn.
 
     Args:
-        source: Address of its picture, as ``onedemo.clips.compose_clip`` makes it.
+        source: Address of its picture, as ``onedemo.render.clip_image.compose_clip`` makes it.
         fps: Frames per second.
         sides: "left", "right", each with a caption, or "both" on one canvas.
         attributes: More attributes of the element.

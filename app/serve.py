@@ -16,7 +16,7 @@ from onedemo.app.study import Study
 from onedemo.config import RunConfig
 from onedemo.encoders import make_encoder
 from onedemo.records import Demo
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.runs import add_run, find_run
 from onedemo.storage.store import Store
 

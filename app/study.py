@@ -17,7 +17,7 @@ from onedemo.errors import UserError
 from onedemo.loop import Trainer
 from onedemo.predictor import Snapshot, check_start
 from onedemo.records import Demo
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.runs import add_run, find_run
 from onedemo.storage.store import Store
 from onedemo.transfer import newest_snapshot

@@ -74,7 +74,7 @@ class StandIn:
         self.add_clips(clips)
 
     def add_clips(self, count: int) -> list[int]:
-        from onedemo.clips import compose_clip
+        from onedemo.render.clip_image import compose_clip
 
         new = [
             NewClip(demo_step=25 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
@@ -108,7 +108,7 @@ class StandIn:
         return self.directory / f"pair-{pair_id}.jpg"
 
     def add_pairs(self, count: int) -> list[int]:
-        from onedemo.clips import compose_clip
+        from onedemo.render.clip_image import compose_clip
         from onedemo.storage.comparisons import NewPair
 
         pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)

@@ -11,7 +11,7 @@ from onedemo import appearance
 from onedemo.appearance import Appearance, learn, pictures, regress
 from onedemo.demos import list_demos, stream_frames
 from onedemo.encoders import make_encoder
-from onedemo.render import HEIGHT, WIDTH, Renderer
+from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 from onedemo.sim import kinematics
 
 

@@ -29,11 +29,11 @@ from onedemo.asking import Simulated
 from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.bench.annotators import browser_session, open_tab, rating
 from onedemo.bench.serving import reach, serving
-from onedemo.clips import compose_clip
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos import import_video
 from onedemo.errors import UserError
 from onedemo.predictor import Snapshot
+from onedemo.render.clip_image import compose_clip
 from onedemo.storage.store import FILE_NAME, Store
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")

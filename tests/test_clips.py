@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from onedemo.backdrop import Camera, backdrop
-from onedemo.clips import (
+from onedemo.render.backdrop import Camera, backdrop
+from onedemo.render.clip_image import (
     CLIP_HEIGHT,
     CLIP_WIDTH,
     GAP,

@@ -9,7 +9,7 @@ from worlds import falling_demo, falling_states
 
 from onedemo.app.progress import chosen, gallery_html, timeline_html
 from onedemo.gallery import PARTS, Episode, Gallery
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.video import VideoReader, count_frames
 
 

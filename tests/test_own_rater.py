@@ -7,7 +7,6 @@ import pytest
 from test_scripted import Untouchable
 from worlds import STEPS, Thumbnail, falling_demo, small_config
 
-from onedemo.clips import fit
 from onedemo.demos import read_frames
 from onedemo.errors import UserError
 from onedemo.headless import train
@@ -15,7 +14,8 @@ from onedemo.hidden import hidden_path, load_hidden
 from onedemo.judge import RatingBudgetSpent
 from onedemo.raters import make_rater
 from onedemo.records import Segment
-from onedemo.render import Renderer
+from onedemo.render.clip_image import fit
+from onedemo.render.renderer import Renderer
 from onedemo.storage.store import Store
 
 SOURCE = """

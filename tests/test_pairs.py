@@ -20,7 +20,7 @@ from onedemo.errors import UserError
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing, draw_pairs
 from onedemo.records import Segment
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.store import Store
 

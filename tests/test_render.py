@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onedemo.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
-from onedemo.render import HEIGHT, WIDTH, Renderer, RenderThread
+from onedemo.render.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
+from onedemo.render.renderer import HEIGHT, WIDTH, Renderer, RenderThread
 from onedemo.timing import frame_of_step, steps_of_frames
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
@@ -243,7 +243,7 @@ def test_close_ends_the_job_in_hand_and_cancels_the_rest():
 _DRAW = """
 import onedemo.sim.vector_env, mujoco
 from onedemo.errors import UserError
-from onedemo.render import Renderer, RenderThread
+from onedemo.render.renderer import Renderer, RenderThread
 mujoco.MjModel.from_xml_string("<mujoco/>")
 for make in (Renderer, RenderThread):
     try:

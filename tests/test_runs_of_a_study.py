@@ -13,7 +13,7 @@ from onedemo.core.files import hold
 from onedemo.errors import UserError
 from onedemo.loop import Trainer
 from onedemo.records import Rater
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.runs import add_run
 from onedemo.storage.store import Store
 

@@ -14,7 +14,7 @@ from onedemo.appearance import Track
 from onedemo.config import load_config
 from onedemo.hidden import HiddenStates, hidden_path, save_hidden
 from onedemo.records import Demo
-from onedemo.render import Renderer
+from onedemo.render.renderer import Renderer
 from onedemo.sim import kinematics, vector_env
 from onedemo.sim.task_rewards import joint_points
 from onedemo.video import write_webm

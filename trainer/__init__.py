@@ -5,7 +5,7 @@ It never imports ``app``, the web application on top of it.
 
 import os
 
-from onedemo.gl import choose_backend
+from onedemo.render.gl_context import choose_backend
 
 # NumPy's matrix products here are small: threads of its own would only fight with the physics'.
 # Read once, at NumPy's first import.

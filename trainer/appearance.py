@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.encoders import Encoder
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.sim import kinematics, vector_env
 from onedemo.starts import wild_rollouts
 

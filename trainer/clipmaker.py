@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.clips import compose_clip
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.errors import in_words
 from onedemo.records import Clip
-from onedemo.render import Renderer, RenderThread
+from onedemo.render.clip_image import compose_clip
+from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.storage.store import Store
 
 log = logging.getLogger("onedemo")

@@ -159,7 +159,7 @@ def render_demo(
     Raises:
         UserError: If the name is not allowed or this machine cannot draw.
     """
-    from onedemo.render import Renderer
+    from onedemo.render.renderer import Renderer
 
     check_name(name)
     count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)

@@ -20,7 +20,7 @@ from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos import list_demos
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
-from onedemo.render import HEIGHT, WIDTH, RenderThread
+from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.schema import STEPS, check_version
 from onedemo.storage.store import FILE_NAME
 from onedemo.transfer import snapshot_file

@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from onedemo.clips import side_by_side
 from onedemo.core.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
 from onedemo.demos import read_frames
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts
-from onedemo.render import Renderer, RenderThread
+from onedemo.render.clip_image import side_by_side
+from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.video import write_webm
 
 PARTS = 40

@@ -36,7 +36,7 @@ from onedemo.pairing import Pairing
 from onedemo.policy import PolicySnapshot
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts, Status
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS

@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.clips import fit
 from onedemo.demos import read_frames
 from onedemo.errors import UserError
 from onedemo.judge import Budget
 from onedemo.records import Demo, Segment
+from onedemo.render.clip_image import fit
 from onedemo.sim import vector_env
 from onedemo.timing import frame_of_step
 
@@ -89,7 +89,7 @@ class OwnRater(Budget):
 
     def _clips(self, segment: Segment, demo_step: int) -> tuple[np.ndarray, np.ndarray]:
         """The pictures of ``onedemo.clipmaker``: one of the robot for each frame of the demo's clip."""
-        from onedemo.render import RenderThread
+        from onedemo.render.renderer import RenderThread
 
         if self._frames is None:
             self._frames = read_frames(self._demo)

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.choice import choose
-from onedemo.clips import compose_clip
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.learner import Learner
 from onedemo.records import Rollouts
-from onedemo.render import Renderer, RenderThread
+from onedemo.render.clip_image import compose_clip
+from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.storage.comparisons import NewPair, Pair
 from onedemo.storage.store import Store
 

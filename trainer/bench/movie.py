@@ -8,10 +8,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from onedemo.clips import frame_durations, side_by_side
 from onedemo.demos import read_frames
 from onedemo.records import Demo
-from onedemo.render import RenderThread
+from onedemo.render.clip_image import frame_durations, side_by_side
+from onedemo.render.renderer import RenderThread
 
 MOST_BYTES = 400_000
 

@@ -25,7 +25,7 @@ from onedemo.errors import UserError
 from onedemo.folded import SIDE
 from onedemo.predictor import visual_inputs
 from onedemo.records import Demo
-from onedemo.render import RenderThread
+from onedemo.render.renderer import RenderThread
 from onedemo.video import write_webm
 
 _CLIP = 10  # pictures

@@ -8,10 +8,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from onedemo.clips import SIDE_HEIGHT, SIDE_WIDTH, fit
 from onedemo.demos import read_frames
 from onedemo.records import Demo
-from onedemo.render import RenderThread
+from onedemo.render.clip_image import SIDE_HEIGHT, SIDE_WIDTH, fit
+from onedemo.render.renderer import RenderThread
 
 _SHOWN = 8
 _WIDTH, _HEIGHT = 180, 135

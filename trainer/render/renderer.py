@@ -1,7 +1,7 @@
 """Pictures of the robot from stored positions, without a screen.
 
 The robot alone is drawn by MuJoCo, at twice the size and then averaged down (smooth edges at a
-half of the price of multisampling); sky, floor and shadow come from ``onedemo.backdrop``.
+half of the price of multisampling); sky, floor and shadow come from ``onedemo.render.backdrop``.
 The camera follows the robot along the track but keeps its height, so that a jump is seen as one;
 it rises only when the robot would leave the picture.
 
@@ -24,10 +24,10 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from onedemo.backdrop import Camera, backdrop
 from onedemo.core.cpu import give_way
 from onedemo.errors import UserError
-from onedemo.gl import open_context
+from onedemo.render.backdrop import Camera, backdrop
+from onedemo.render.gl_context import open_context
 
 log = logging.getLogger("onedemo")
 

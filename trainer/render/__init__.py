@@ -1,0 +1,1 @@
+"""The robot as pictures, offscreen, and clips as one picture each."""
