@@ -214,7 +214,7 @@ def _serve(arguments: argparse.Namespace) -> None:
     from onedemo.app.assignment import Again
     from onedemo.app.listening import Listening
     from onedemo.app.serve import serve
-    from onedemo.demos import find_demo
+    from onedemo.demos.library import find_demo
 
     listening = Listening(
         host=arguments.host, port=arguments.port, tls_cert=arguments.tls_cert, tls_key=arguments.tls_key,
@@ -242,7 +242,7 @@ def _serve(arguments: argparse.Namespace) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     from onedemo.core.files import write_atomic
-    from onedemo.demos import find_demo
+    from onedemo.demos.library import find_demo
     from onedemo.encoders import make_encoder
     from onedemo.headless import train
     from onedemo.storage.store import Store
@@ -279,7 +279,7 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _demo_add(arguments: argparse.Namespace) -> None:
-    from onedemo.demos import import_video
+    from onedemo.demos.library import import_video
 
     demo = import_video(
         arguments.video,
@@ -298,14 +298,14 @@ def _demo_add(arguments: argparse.Namespace) -> None:
 
 
 def _demo_list(arguments: argparse.Namespace) -> None:
-    from onedemo.demos import list_demos
+    from onedemo.demos.library import list_demos
 
     for demo in list_demos(arguments.data_dir / "demos"):
         print(f"{demo.name:24} {demo.seconds:5.1f} s  {demo.width}x{demo.height}  {demo.source}")
 
 
 def _demo_show(arguments: argparse.Namespace) -> None:
-    from onedemo.demos import find_demo, show
+    from onedemo.demos.library import find_demo, show
 
     print(show(find_demo(arguments.name, arguments.data_dir / "demos")))
 
@@ -355,7 +355,7 @@ def _baseline_preferences(arguments: argparse.Namespace) -> None:
 
 
 def _crop(text: str) -> tuple[int, int, int, int]:
-    from onedemo.demo_checks import read_crop
+    from onedemo.demos.import_checks import read_crop
 
     try:
         return read_crop(text)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from onedemo.demos import read_frames
+from onedemo.demos.library import read_frames
 from onedemo.records import Demo
 from onedemo.render.clip_image import compose_clip
 from onedemo.storage.store import Store

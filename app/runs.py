@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from onedemo.app import charts
 from onedemo.app.uploads import form_html
 from onedemo.config import METHODS
-from onedemo.demos import list_demos
+from onedemo.demos.library import list_demos
 from onedemo.records import HALTED, Status
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
 from onedemo.core.files import hold
-from onedemo.demos import find_demo
+from onedemo.demos.library import find_demo
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
 from onedemo.loop import Trainer

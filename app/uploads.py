@@ -1,6 +1,6 @@
 """A video that a researcher sends over HTTP becomes a demo.
 
-It is streamed to a file under a name of our own, decoded by a limited child (``onedemo.guarded``) and
+It is streamed to a file under a name of our own, decoded by a limited child (``onedemo.demos.sandboxed_decoder``) and
 added exactly as ``onedemo demo add`` does. Whatever happens, the file is gone afterwards.
 """
 
@@ -17,8 +17,8 @@ from typing import Any
 
 from aiohttp import BodyPartReader, web
 
-from onedemo.demo_checks import read_crop
-from onedemo.demos import import_video
+from onedemo.demos.import_checks import read_crop
+from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 
 LARGEST = 500 << 20

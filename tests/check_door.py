@@ -41,10 +41,10 @@ from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
 from onedemo.app.pictures import Pictures
 from onedemo.app.server import Page
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
+from onedemo.demos.sandboxed_decoder import Limits
+from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
-from onedemo.guarded import Limits
-from onedemo.video import write_webm
 
 FULL = {"messages": 100_000, "requests": 10_000, "videos": 500}
 QUICK = {"messages": 1_000, "requests": 200, "videos": 6}

@@ -120,7 +120,7 @@ class StandIn:
         return ids
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
-        from onedemo.video import write_webm
+        from onedemo.demos.video import write_webm
 
         if not 1 <= iteration <= len(self.store.iterations(self.run)):
             raise FileNotFoundError(iteration)

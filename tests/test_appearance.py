@@ -9,7 +9,7 @@ from worlds import FRAME_STEPS, Thumbnail, falling_states
 
 from onedemo import appearance
 from onedemo.appearance import Appearance, learn, pictures, regress
-from onedemo.demos import list_demos, stream_frames
+from onedemo.demos.library import list_demos, stream_frames
 from onedemo.encoders import make_encoder
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 from onedemo.sim import kinematics

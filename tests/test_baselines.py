@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from onedemo.baselines import handcoded, trajopt
+from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.errors import UserError
-from onedemo.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import evaluate
 from onedemo.sim import vector_env

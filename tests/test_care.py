@@ -30,7 +30,7 @@ from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.bench.annotators import browser_session, open_tab, rating
 from onedemo.bench.serving import reach, serving
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.predictor import Snapshot
 from onedemo.render.clip_image import compose_clip

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from onedemo import demos
-from onedemo.demos import find_demo, import_video, list_demos, read_frames, render_demo, show
+from onedemo.demos import library as demos
+from onedemo.demos.library import find_demo, import_video, list_demos, read_frames, render_demo, show
+from onedemo.demos.video import VideoReader, count_frames, resample, write_webm
 from onedemo.errors import UserError
-from onedemo.video import VideoReader, count_frames, resample, write_webm
 
 WIDTH, HEIGHT = 160, 96
 REAL_VIDEOS = Path(__file__).resolve().parent.parent.parent / "shared" / "videos"
@@ -264,7 +264,7 @@ def test_bad_options_are_refused(video, library, options, words):
 _IMPORT_WITH_LITTLE_SPACE = """
 import resource, sys
 from pathlib import Path
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
 try:

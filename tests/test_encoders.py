@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from onedemo import encoders
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
+from onedemo.demos.video import write_webm
 from onedemo.encoders import (
     EfficientNetLite0,
     Vgg16,
@@ -20,7 +21,6 @@ from onedemo.encoders import (
 )
 from onedemo.errors import UserError
 from onedemo.folded import Folded, has_fused
-from onedemo.video import write_webm
 
 needs_fused = pytest.mark.skipif(not has_fused(), reason="this PyTorch comes without oneDNN")
 
@@ -304,7 +304,7 @@ def test_damaged_features_are_made_anew(demo, tmp_path, caplog, damage):
 
 
 def test_features_beside_the_demo_leave_the_library_as_it_was(demo, tmp_path):
-    from onedemo.demos import list_demos
+    from onedemo.demos.library import list_demos
 
     demo_features(demo, Counting(), tmp_path / "demos")
     assert demo in list_demos(tmp_path / "demos")

@@ -7,13 +7,13 @@ import pytest
 
 from onedemo.alignment import align
 from onedemo.bench.controls import TrueRating
-from onedemo.demos import BUILT_IN, find_demo
+from onedemo.demos.frame_clock import steps_of_frames
+from onedemo.demos.ground_truth import load_hidden
+from onedemo.demos.library import BUILT_IN, find_demo
 from onedemo.evaluation import aligned_similarity, per_episode, spread, state_errors
-from onedemo.hidden import load_hidden
 from onedemo.raters import Oracle
 from onedemo.rollouts import Episodes
 from onedemo.sim import vector_env
-from onedemo.timing import steps_of_frames
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from test_demos import make_video, refused
 
-from onedemo import guarded
+from onedemo.demos import sandboxed_decoder
+from onedemo.demos.sandboxed_decoder import Limits, Options, decode
 from onedemo.errors import UserError
-from onedemo.guarded import Limits, Options, decode
 
 pytestmark = pytest.mark.seam
 
@@ -72,9 +72,9 @@ def test_a_bomb_is_refused_without_growing(tmp_path, library, make, suffix, word
 
 
 def test_more_frames_than_anybody_needs(tmp_path, library, monkeypatch):
-    monkeypatch.setattr("onedemo.demo_checks.MAX_FRAMES", 20)
+    monkeypatch.setattr("onedemo.demos.import_checks.MAX_FRAMES", 20)
     with pytest.raises(UserError, match="more than 20 frames"):
-        list(guarded.shaped_frames(make_video(tmp_path / "a.avi", count=30), Options()))
+        list(sandboxed_decoder.shaped_frames(make_video(tmp_path / "a.avi", count=30), Options()))
 
 
 def test_memory_processor_time_and_wall_time_are_limited(tmp_path, library):
@@ -112,7 +112,7 @@ def test_the_child_is_gone_when_nobody_wants_more(tmp_path):
 
 def _children():
     listing = [p.read_text() for p in Path("/proc").glob("[0-9]*/cmdline") if _mine(p.parent)]
-    return [line for line in listing if "onedemo.guarded" in line]
+    return [line for line in listing if "onedemo.demos.sandboxed_decoder" in line]
 
 
 def _mine(process):
@@ -138,7 +138,9 @@ def test_whatever_the_child_says_is_checked(tmp_path, library, monkeypatch, code
     """As if a decoder had been taken over: its process says what it likes, and dies as it likes."""
     child = subprocess.Popen
     monkeypatch.setattr(
-        guarded.subprocess, "Popen", lambda command, **how: child([sys.executable, "-c", code], **how)
+        sandboxed_decoder.subprocess,
+        "Popen",
+        lambda command, **how: child([sys.executable, "-c", code], **how),
     )
     assert "cannot be decoded" in refused(make_video(tmp_path / "a.avi", count=3), library)
 
@@ -148,7 +150,9 @@ def test_the_child_knows_nothing_of_its_parent(tmp_path, monkeypatch):
     seen = {}
     child = subprocess.Popen
     monkeypatch.setattr(
-        guarded.subprocess, "Popen", lambda command, **how: seen.update(how) or child(command, **how)
+        sandboxed_decoder.subprocess,
+        "Popen",
+        lambda command, **how: seen.update(how) or child(command, **how),
     )
     monkeypatch.setenv("SECRET", "x")
     list(decode(make_video(tmp_path / "a.avi", count=3), Options()))

@@ -14,8 +14,8 @@ from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 import onedemo
 from onedemo.appearance import regress
 from onedemo.asking import Simulated, due_in_round
+from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.headless import train
-from onedemo.hidden import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.loop import Trainer
 from onedemo.metric import MetricSnapshot
 from onedemo.practice import PracticeRules

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from onedemo.demos.frame_clock import frame_of_step
 from onedemo.judge import Judge
 from onedemo.marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.records import Segment
 from onedemo.storage.store import NewClip, RatedSegment, Store
-from onedemo.timing import frame_of_step
 from onedemo.training_set import TrainingSet
 
 W = 20

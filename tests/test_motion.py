@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from onedemo.demos import BUILT_IN
-from onedemo.hidden import load_hidden
+from onedemo.demos.ground_truth import load_hidden
+from onedemo.demos.library import BUILT_IN
 from onedemo.sim import task_rewards, vector_env
 
 DT = 0.008

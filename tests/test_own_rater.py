@@ -7,10 +7,10 @@ import pytest
 from test_scripted import Untouchable
 from worlds import STEPS, Thumbnail, falling_demo, small_config
 
-from onedemo.demos import read_frames
+from onedemo.demos.ground_truth import hidden_path, load_hidden
+from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.headless import train
-from onedemo.hidden import hidden_path, load_hidden
 from onedemo.judge import RatingBudgetSpent
 from onedemo.raters import make_rater
 from onedemo.records import Segment

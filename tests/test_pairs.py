@@ -15,7 +15,7 @@ from onedemo.app.columns import COMPARISONS
 from onedemo.app.desk import AnsweredElsewhere
 from onedemo.app.pair_desk import PairDesk
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
-from onedemo.demos import read_frames
+from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing, draw_pairs

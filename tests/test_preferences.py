@@ -14,8 +14,8 @@ from onedemo.baselines import preferences, reward_model
 from onedemo.baselines.comparer import Comparer, ComparisonBudgetSpent, agreement
 from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, draw_pairs, train_preferences
 from onedemo.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
+from onedemo.demos.ground_truth import load_hidden
 from onedemo.errors import UserError
-from onedemo.hidden import load_hidden
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.records import Segment
 from onedemo.rollouts import Collector

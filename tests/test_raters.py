@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
+from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
 from onedemo.headless import train
-from onedemo.hidden import HiddenStates
 from onedemo.raters import Oracle, RatingBudgetSpent, appearance, make_rater
 from onedemo.records import Demo, Segment
 from onedemo.sim.vector_env import observe, spec

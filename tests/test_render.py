@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from onedemo.demos.frame_clock import frame_of_step, steps_of_frames
 from onedemo.render.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer, RenderThread
-from onedemo.timing import frame_of_step, steps_of_frames
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
 REPO = Path(__file__).resolve().parent.parent

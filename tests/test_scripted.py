@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import onedemo
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.learner import Learner
 from onedemo.raters import make_rater

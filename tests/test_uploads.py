@@ -14,7 +14,7 @@ from onedemo.app.door import Door, Route
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
 from onedemo.app.uploads import Uploads
-from onedemo.demos import find_demo, read_frames
+from onedemo.demos.library import find_demo, read_frames
 from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam

@@ -12,12 +12,12 @@ import numpy as np
 
 from onedemo.appearance import Track
 from onedemo.config import load_config
-from onedemo.hidden import HiddenStates, hidden_path, save_hidden
+from onedemo.demos.ground_truth import HiddenStates, hidden_path, save_hidden
+from onedemo.demos.video import write_webm
 from onedemo.records import Demo
 from onedemo.render.renderer import Renderer
 from onedemo.sim import kinematics, vector_env
 from onedemo.sim.task_rewards import joint_points
-from onedemo.video import write_webm
 
 STEPS = 250
 FRAMES = 60

@@ -17,7 +17,7 @@ import numpy as np
 from packaging.requirements import Requirement
 
 from onedemo.core.files import archive_fault, jpeg_fault
-from onedemo.demos import list_demos
+from onedemo.demos.library import list_demos
 from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread

@@ -25,7 +25,7 @@ import torch
 from torch import nn
 
 from onedemo.core.files import read_whole, write_atomic
-from onedemo.demos import stream_frames
+from onedemo.demos.library import stream_frames
 from onedemo.errors import UserError
 from onedemo.folded import BATCH, SIDE, Folded
 from onedemo.records import Demo

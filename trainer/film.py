@@ -9,8 +9,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from onedemo.demos import BUILT_IN, render_demo, show
-from onedemo.hidden import SUFFIX, load_hidden
+from onedemo.demos.ground_truth import SUFFIX, load_hidden
+from onedemo.demos.library import BUILT_IN, render_demo, show
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from onedemo.asking import Simulated
 from onedemo.config import RunConfig
 from onedemo.core.files import hold
+from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.encoders import Encoder
 from onedemo.evaluation import summarise
-from onedemo.hidden import hidden_path, load_hidden
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
 from onedemo.predictor import Snapshot

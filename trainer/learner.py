@@ -17,6 +17,7 @@ import numpy as np
 from onedemo.appearance import Track
 from onedemo.choice import Question, choose
 from onedemo.config import RunConfig
+from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
 from onedemo.imagined import track_basis
 from onedemo.policy import Policy, PolicySnapshot, check_device
@@ -27,7 +28,6 @@ from onedemo.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.sim import kinematics, vector_env
 from onedemo.starts import wild_rollouts
 from onedemo.storage.store import RatedSegment
-from onedemo.timing import frame_of_step
 from onedemo.trpo import Trpo
 
 _RANDOM_LANES = 16

@@ -28,7 +28,7 @@ from onedemo.clipmaker import ClipMaker
 from onedemo.config import RunConfig
 from onedemo.core.cpu import give_way
 from onedemo.core.files import read_whole
-from onedemo.demos import read_frames
+from onedemo.demos.library import read_frames
 from onedemo.encoders import Encoder, demo_features
 from onedemo.errors import in_words
 from onedemo.learner import Learner

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.demos import read_frames
+from onedemo.demos.frame_clock import frame_of_step
+from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.judge import Budget
 from onedemo.records import Demo, Segment
 from onedemo.render.clip_image import fit
 from onedemo.sim import vector_env
-from onedemo.timing import frame_of_step
 
 
 class OwnRater(Budget):

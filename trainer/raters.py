@@ -3,7 +3,7 @@
 ``oracle``, ``script[:TABLE.json]`` or ``package.module:Class``; the first two may be followed by error
 models, ``oracle+mistake:0.1+jitter`` (``onedemo.rater_errors``), and by ``+seed:N``.
 
-Nothing that learns may import this module or ``onedemo.hidden``: a rater sees the demo's states, the
+Nothing that learns may import this module or ``onedemo.demos.ground_truth``: a rater sees the demo's states, the
 learner sees nothing but the rating.
 
 Shapes: W control steps, q = v = 6.
@@ -18,8 +18,8 @@ from typing import Protocol
 
 import numpy as np
 
+from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.hidden import HiddenStates
 from onedemo.judge import Judge, RatingBudgetSpent
 from onedemo.own_rater import OwnRater
 from onedemo.rater_errors import Errors, parse_errors

@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from onedemo.baselines.scores import Score, judge, save_training
 from onedemo.core.cpu import cores
+from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.hidden import HiddenStates
 from onedemo.policy import Policy, PolicyConfig, check_device
 from onedemo.rollouts import Collector, evaluate
 from onedemo.sim import vector_env

@@ -36,8 +36,8 @@ from onedemo.baselines.reward_model import (
 from onedemo.baselines.scores import Score, judge, save_training
 from onedemo.config import split_ratings
 from onedemo.core.cpu import cores
+from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.hidden import HiddenStates
 from onedemo.policy import Policy, PolicyConfig
 from onedemo.rollouts import Collector, Transitions, evaluate
 from onedemo.sim import vector_env

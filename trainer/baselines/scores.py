@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
+from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.policy import Policy
 from onedemo.rollouts import Episodes
 from onedemo.sim import vector_env

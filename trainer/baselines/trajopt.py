@@ -22,8 +22,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.errors import UserError
-from onedemo.hidden import SUFFIX, HiddenStates, save_hidden
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import (
     backflip_reward,

@@ -20,17 +20,17 @@ from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, 
 from onedemo.baselines.scores import Score
 from onedemo.bench.method import POINTS, Watch, hidden_of, oracle_of, outcome
 from onedemo.config import load_config
-from onedemo.demos import find_demo
+from onedemo.demos.frame_clock import steps_of_frames
+from onedemo.demos.ground_truth import HiddenStates
+from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation import per_episode, perform_policy
-from onedemo.hidden import HiddenStates
 from onedemo.learner import Learner
 from onedemo.policy import Policy
 from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
 from onedemo.raters import Oracle, appearance
 from onedemo.records import Demo
 from onedemo.sim import kinematics, vector_env
-from onedemo.timing import steps_of_frames
 from onedemo.trpo import TrpoConfig
 
 _TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}

@@ -27,11 +27,12 @@ from onedemo.appearance import learn as learn_appearance
 from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
 from onedemo.core.files import hold
-from onedemo.demos import find_demo
+from onedemo.demos.frame_clock import steps_of_frames
+from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
+from onedemo.demos.library import find_demo
 from onedemo.encoders import demo_features, make_encoder
 from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
 from onedemo.headless import train
-from onedemo.hidden import HiddenStates, hidden_path, load_hidden
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle
@@ -39,7 +40,6 @@ from onedemo.records import Demo
 from onedemo.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
-from onedemo.timing import steps_of_frames
 
 POINTS = 12
 """Of a learning curve."""

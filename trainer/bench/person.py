@@ -15,7 +15,7 @@ from onedemo.bench import method
 from onedemo.bench.method import whole_config
 from onedemo.bench.study import Job
 from onedemo.core.files import hold
-from onedemo.demos import import_video
+from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.records import Demo
 

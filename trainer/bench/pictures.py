@@ -19,14 +19,14 @@ import torch
 
 from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
 from onedemo.config import PredictorConfig
-from onedemo.demos import find_demo, read_frames
+from onedemo.demos.library import find_demo, read_frames
+from onedemo.demos.video import write_webm
 from onedemo.encoders import EfficientNetLite0, demo_features, published_lite0
 from onedemo.errors import UserError
 from onedemo.folded import SIDE
 from onedemo.predictor import visual_inputs
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
-from onedemo.video import write_webm
 
 _CLIP = 10  # pictures
 _WIDTH, _HEIGHT = 320, 240
@@ -40,7 +40,7 @@ _CACHED = """
 import sys, time
 from pathlib import Path
 from typing import Any, TypeVar
-from onedemo.demos import find_demo
+from onedemo.demos.library import find_demo
 from onedemo.encoders import demo_features, make_encoder
 demo = find_demo(sys.argv[1], Path(sys.argv[2]))
 began = time.perf_counter()

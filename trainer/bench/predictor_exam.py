@@ -15,7 +15,7 @@ import numpy as np
 
 from onedemo.bench.predictor_scores import spearman
 from onedemo.choice import choose
-from onedemo.hidden import HiddenStates
+from onedemo.demos.ground_truth import HiddenStates
 from onedemo.learner import Learner
 from onedemo.practice import fill_bank
 from onedemo.predictor import Snapshot

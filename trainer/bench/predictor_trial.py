@@ -22,9 +22,9 @@ from onedemo.bench.method import prepare
 from onedemo.bench.predictor_exam import Exam
 from onedemo.bench.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
 from onedemo.config import load_config
-from onedemo.demos import find_demo
+from onedemo.demos.ground_truth import hidden_path, load_hidden
+from onedemo.demos.library import find_demo
 from onedemo.encoders import demo_features
-from onedemo.hidden import hidden_path, load_hidden
 from onedemo.learner import Learner
 from onedemo.predictor import CLASSES, Snapshot
 from onedemo.raters import Oracle

@@ -8,7 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from onedemo.demos import read_frames
+from onedemo.demos.library import read_frames
 from onedemo.records import Demo
 from onedemo.render.clip_image import SIDE_HEIGHT, SIDE_WIDTH, fit
 from onedemo.render.renderer import RenderThread

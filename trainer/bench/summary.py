@@ -18,7 +18,7 @@ from onedemo.bench.blocks import Block, Cell, Chart, Line, Picture, Table, numbe
 from onedemo.bench.movie import movie
 from onedemo.bench.seeds import band, spread
 from onedemo.bench.study import Outcome
-from onedemo.demos import find_demo
+from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 
 Result = Mapping[str, Any]

@@ -15,7 +15,7 @@ from typing import Any
 
 from onedemo.bench import method
 from onedemo.bench.study import Job
-from onedemo.demos import find_demo
+from onedemo.demos.library import find_demo
 from onedemo.headless import train
 from onedemo.storage.store import Store
 from onedemo.transfer import newest_snapshot

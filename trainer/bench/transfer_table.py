@@ -25,7 +25,7 @@ from onedemo.bench.summary import (
     table,
 )
 from onedemo.bench.transfer import transfer_job
-from onedemo.demos import find_demo
+from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 
 TITLE = "onedemo: from one move to another"

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
+from onedemo.demos.video import VideoReader
 from onedemo.errors import UserError
-from onedemo.video import VideoReader
 
 MAX_SECONDS = 60.0
 MAX_FRAMES = 200_000

@@ -26,12 +26,12 @@ import numpy as np
 from onedemo import static
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_name
-from onedemo.demo_checks import check_options
+from onedemo.demos.frame_clock import steps_of_frames
+from onedemo.demos.import_checks import check_options
+from onedemo.demos.sandboxed_decoder import Limits, Options, decode
+from onedemo.demos.video import VideoReader, write_webm
 from onedemo.errors import UserError
-from onedemo.guarded import Limits, Options, decode
 from onedemo.records import Demo
-from onedemo.timing import steps_of_frames
-from onedemo.video import VideoReader, write_webm
 
 BUILT_IN = Path(static.__file__).parent / "demos"
 

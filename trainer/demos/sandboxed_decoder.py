@@ -30,9 +30,9 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
-from onedemo.demo_checks import MAX_SECONDS, SourceWatch, check_length, check_size
+from onedemo.demos.import_checks import MAX_SECONDS, SourceWatch, check_length, check_size
+from onedemo.demos.video import VideoReader, resample
 from onedemo.errors import UserError
-from onedemo.video import VideoReader, resample
 
 STORED_SIDE = 640
 """Pixels, of the longer side of what is stored: more than a clip ever shows."""
@@ -59,7 +59,7 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Options:
-    """Which part of a video is wanted, and how, as checked by ``onedemo.demo_checks``."""
+    """Which part of a video is wanted, and how, as checked by ``onedemo.demos.import_checks``."""
 
     start: float | None = None
     """Seconds."""
@@ -96,7 +96,7 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
     root = str(Path(__file__).resolve().parent.parent)
     told = json.dumps([str(path.resolve()), _plain(options), limits.memory, limits.cpu_seconds])
     child = subprocess.Popen(
-        [sys.executable, "-P", "-B", "-m", "onedemo.guarded", told],
+        [sys.executable, "-P", "-B", "-m", "onedemo.demos.sandboxed_decoder", told],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -1,0 +1,1 @@
+"""Demonstration videos: import, normalise, list, read; and what was behind a simulated one."""
