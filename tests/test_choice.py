@@ -3,7 +3,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from onedemo.choice import choose
+from onedemo.queries.selection import choose
 from onedemo.records import Rollouts
 
 

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
-from onedemo.choice import CHOICES
 from onedemo.errors import UserError
 from onedemo.policy import PolicyConfig
 from onedemo.practice import PracticeConfig
 from onedemo.predictor import PredictorConfig
+from onedemo.queries.selection import CHOICES
 from onedemo.trpo import TrpoConfig
 
 T = TypeVar("T")

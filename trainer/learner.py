@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from onedemo.appearance import Track
-from onedemo.choice import Question, choose
 from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
@@ -23,6 +22,7 @@ from onedemo.imagined import track_basis
 from onedemo.policy import Policy, PolicySnapshot, check_device
 from onedemo.practice import PracticeRules, fill_bank
 from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
+from onedemo.queries.selection import Question, choose
 from onedemo.records import Rollouts, Segment
 from onedemo.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.sim import kinematics, vector_env
@@ -152,7 +152,7 @@ class Learner:
     def choose(
         self, rollouts: Rollouts, snapshot: Snapshot | None, count: int, rng: np.random.Generator
     ) -> list[Question]:
-        """Chooses clips of rollouts to be rated, by the run's settings (``trainer/choice.py``)."""
+        """Chooses clips of rollouts to be rated, by the run's settings (``trainer/queries/selection.py``)."""
         config = self.config.ratings
         snapshot = snapshot or self._first
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.choice import choose
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.learner import Learner
+from onedemo.queries.selection import choose
 from onedemo.records import Rollouts
 from onedemo.render.clip_image import compose_clip
 from onedemo.render.renderer import Renderer, RenderThread

@@ -126,7 +126,7 @@ class Clip:
     steps: int
     """Length, in control steps."""
     choice: str = ""
-    """Why it was chosen (``trainer/choice.py``); "" if it was before that was kept."""
+    """Why it was chosen (``trainer/queries/selection.py``); "" if it was before that was kept."""
     score: float | None = None
     """By what it was chosen: a predicted rating, a disagreement; None if by chance."""
 

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from onedemo.bench.predictor_scores import spearman
-from onedemo.choice import choose
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.learner import Learner
 from onedemo.practice import fill_bank
 from onedemo.predictor import Snapshot
+from onedemo.queries.selection import choose
 from onedemo.raters import Oracle
 from onedemo.records import Rollouts, Segment
 from onedemo.sim import vector_env

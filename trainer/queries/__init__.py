@@ -1,0 +1,1 @@
+"""Which clips are put to an annotator. Pure functions on arrays."""
