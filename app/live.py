@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from onedemo.rollouts import Acting
+from onedemo.rl.rollouts import Acting
 from onedemo.sim import vector_env
 
 log = logging.getLogger("onedemo.page")

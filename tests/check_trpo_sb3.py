@@ -14,10 +14,10 @@ import gymnasium
 import numpy as np
 import torch
 
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import Collector, evaluate
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector, evaluate
+from onedemo.rl.trpo import Trpo, TrpoConfig
 from onedemo.sim import vector_env
-from onedemo.trpo import Trpo, TrpoConfig
 
 LANES, BATCH, EPISODES = 16, 128, 16
 CONFIG = TrpoConfig(

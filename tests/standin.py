@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.records import Demo, Segment, Status
-from onedemo.rollouts import Acting, EpisodeRules
+from onedemo.rl.rollouts import Acting, EpisodeRules
 from onedemo.storage.store import NewClip, Store
 
 FPS = 30.0

@@ -11,8 +11,8 @@ import torch
 from onedemo.baselines import handcoded, trajopt
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.errors import UserError
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import evaluate
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import evaluate
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import (
     backflip_reward,

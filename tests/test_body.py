@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from onedemo.raters import appearance
+from onedemo.rl.random_states import random_states, wild_rollouts
 from onedemo.sim import kinematics, vector_env
 from onedemo.sim.task_rewards import clearances
-from onedemo.starts import random_states, wild_rollouts
 
 HOPPER = vector_env.spec("hopper")
 

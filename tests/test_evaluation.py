@@ -12,7 +12,7 @@ from onedemo.demos.ground_truth import load_hidden
 from onedemo.demos.library import BUILT_IN, find_demo
 from onedemo.evaluation import aligned_similarity, per_episode, spread, state_errors
 from onedemo.raters import Oracle
-from onedemo.rollouts import Episodes
+from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 
 

@@ -7,7 +7,7 @@ from onedemo.errors import UserError
 from onedemo.evaluation import summarise
 from onedemo.learner import Learner
 from onedemo.metric import MetricSnapshot
-from onedemo.rollouts import evaluate
+from onedemo.rl.rollouts import evaluate
 from onedemo.storage.store import RatedSegment
 
 

@@ -7,7 +7,7 @@ import pytest
 from standin import Wobble
 
 from onedemo.app.live import Live
-from onedemo.rollouts import Acting, EpisodeRules
+from onedemo.rl.rollouts import Acting, EpisodeRules
 
 
 class Hurrying(EpisodeRules):

@@ -19,7 +19,7 @@ from onedemo.headless import train
 from onedemo.loop import Trainer
 from onedemo.metric import MetricSnapshot
 from onedemo.practice import PracticeRules
-from onedemo.rollouts import EpisodeRules, evaluate
+from onedemo.rl.rollouts import EpisodeRules, evaluate
 from onedemo.runs import add_run, find_run
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store

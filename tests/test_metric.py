@@ -11,8 +11,8 @@ from onedemo.imagined import track_basis
 from onedemo.metric import MetricSnapshot
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit
 from onedemo.records import Segment
+from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics
-from onedemo.starts import wild_rollouts
 from onedemo.storage.store import RatedSegment
 
 STEPS, FRAMES = 38, 60

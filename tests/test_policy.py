@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.inputs import HARMONICS, KINDS, feature_size, policy_inputs
-from onedemo.policy import Normaliser, Policy, PolicyConfig, Tanh, ValueFunction, mlp
+from onedemo.rl.policy import Normaliser, Policy, PolicyConfig, Tanh, ValueFunction, mlp
+from onedemo.rl.policy_inputs import HARMONICS, KINDS, feature_size, policy_inputs
 
 
 def policy(kind="clock", seed=0, table=None):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.policy import Policy, PolicyConfig
 from onedemo.practice import Bank, PracticeConfig, PracticeRules, fill_bank
 from onedemo.predictor import PredictorConfig, Snapshot
-from onedemo.rollouts import Collector, Step
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.random_states import wild_rollouts
+from onedemo.rl.rollouts import Collector, Step
 from onedemo.sim import vector_env
-from onedemo.starts import wild_rollouts
 
 DEMO_STEPS = 400
 DT = 0.01

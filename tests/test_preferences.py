@@ -16,9 +16,9 @@ from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, dr
 from onedemo.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.errors import UserError
-from onedemo.policy import Policy, PolicyConfig
 from onedemo.records import Segment
-from onedemo.rollouts import Collector
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import backflip_reward
 

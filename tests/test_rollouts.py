@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from onedemo.errors import UserError
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import Collector, EpisodeRules, Starts, evaluate
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, evaluate
 from onedemo.sim import vector_env
 
 HORIZON = 40

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.nn.utils import parameters_to_vector
 
-from onedemo.fisher import conjugate_gradient, fisher_product, mean_kl
-from onedemo.policy import Policy, PolicyConfig
 from onedemo.records import Rollouts
-from onedemo.rollouts import Collector
+from onedemo.rl.fisher import conjugate_gradient, fisher_product, mean_kl
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector
+from onedemo.rl.trpo import Trpo, TrpoConfig, gae
 from onedemo.sim import vector_env
-from onedemo.trpo import Trpo, TrpoConfig, gae
 
 
 def small_policy(seed=0, log_std=-0.2):
@@ -117,7 +117,7 @@ def test_fisher_product_does_not_depend_on_how_the_samples_are_cut(monkeypatch):
     inputs = torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     vector = torch.arange(parameters(policy).numel(), dtype=torch.float64)
     whole = fisher_product(policy, inputs, damping=0.1)(vector)
-    monkeypatch.setattr("onedemo.fisher._CHUNK", 7)
+    monkeypatch.setattr("onedemo.rl.fisher._CHUNK", 7)
     torch.testing.assert_close(fisher_product(policy, inputs, damping=0.1)(vector), whole)
 
 
@@ -300,7 +300,7 @@ def test_value_after_a_step_that_ended_an_episode_is_of_where_it_ended(monkeypat
         seen.update(values=values, next_values=next_values)
         return gae(rewards, values, next_values, *rest, **options)
 
-    monkeypatch.setattr("onedemo.trpo.gae", spy)
+    monkeypatch.setattr("onedemo.rl.trpo.gae", spy)
     with torch.no_grad():
         values = trpo.value(torch.from_numpy(rollouts.inputs)).numpy()
         next_values = trpo.value(torch.from_numpy(elsewhere)).numpy()

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from onedemo.errors import UserError
-from onedemo.policy import PolicyConfig
 from onedemo.practice import PracticeConfig
 from onedemo.predictor import PredictorConfig
 from onedemo.queries.selection import CHOICES
-from onedemo.trpo import TrpoConfig
+from onedemo.rl.policy import PolicyConfig
+from onedemo.rl.trpo import TrpoConfig
 
 T = TypeVar("T")
 

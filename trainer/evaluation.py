@@ -11,10 +11,10 @@ import numpy as np
 
 from onedemo.alignment import align
 from onedemo.learner import Learner
-from onedemo.policy import PolicySnapshot
 from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle, appearance
-from onedemo.rollouts import EpisodeRules, Episodes, evaluate
+from onedemo.rl.policy import PolicySnapshot
+from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import (
     backflip_reward,

@@ -19,16 +19,16 @@ from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
 from onedemo.imagined import track_basis
-from onedemo.policy import Policy, PolicySnapshot, check_device
 from onedemo.practice import PracticeRules, fill_bank
 from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.queries.selection import Question, choose
 from onedemo.records import Rollouts, Segment
-from onedemo.rollouts import Collector, EpisodeRules, Transitions
+from onedemo.rl.policy import Policy, PolicySnapshot, check_device
+from onedemo.rl.random_states import wild_rollouts
+from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
+from onedemo.rl.trpo import Trpo
 from onedemo.sim import kinematics, vector_env
-from onedemo.starts import wild_rollouts
 from onedemo.storage.store import RatedSegment
-from onedemo.trpo import Trpo
 
 _RANDOM_LANES = 16
 _WILD_LANES = 64

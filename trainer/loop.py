@@ -33,11 +33,11 @@ from onedemo.encoders import Encoder, demo_features
 from onedemo.errors import in_words
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing
-from onedemo.policy import PolicySnapshot
 from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render.renderer import RenderThread
-from onedemo.rollouts import Acting, EpisodeRules, Transitions
+from onedemo.rl.policy import PolicySnapshot
+from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.store import Store

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from onedemo.predictor import CLASSES, Snapshot
-from onedemo.rollouts import EpisodeRules, Rollouts, Starts, Step
+from onedemo.rl.rollouts import EpisodeRules, Rollouts, Starts, Step
 
 _MOVES = np.arange(4)
 _MOVE_COST = 0.02

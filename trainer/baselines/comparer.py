@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from onedemo.records import Segment
-from onedemo.rollouts import Transitions
+from onedemo.rl.rollouts import Transitions
 from onedemo.sim.task_rewards import backflip_reward
 
 

@@ -20,11 +20,11 @@ from onedemo.baselines.scores import Score, judge, save_training
 from onedemo.core.cpu import cores
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.policy import Policy, PolicyConfig, check_device
-from onedemo.rollouts import Collector, evaluate
+from onedemo.rl.policy import Policy, PolicyConfig, check_device
+from onedemo.rl.rollouts import Collector, evaluate
+from onedemo.rl.trpo import Trpo, TrpoConfig
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
-from onedemo.trpo import Trpo, TrpoConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

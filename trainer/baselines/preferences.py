@@ -38,12 +38,12 @@ from onedemo.config import split_ratings
 from onedemo.core.cpu import cores
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import Collector, Transitions, evaluate
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector, Transitions, evaluate
+from onedemo.rl.trpo import Trpo, TrpoConfig
 from onedemo.sim import vector_env
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.store import Store
-from onedemo.trpo import Trpo, TrpoConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
-from onedemo.policy import Policy
-from onedemo.rollouts import Episodes
+from onedemo.rl.policy import Policy
+from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import clean_turns, net_turns, task_reward, until_fall
 

@@ -26,12 +26,12 @@ from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation import per_episode, perform_policy
 from onedemo.learner import Learner
-from onedemo.policy import Policy
 from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
 from onedemo.raters import Oracle, appearance
 from onedemo.records import Demo
+from onedemo.rl.policy import Policy
+from onedemo.rl.trpo import TrpoConfig
 from onedemo.sim import kinematics, vector_env
-from onedemo.trpo import TrpoConfig
 
 _TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}
 """Those that made the built-in demos."""

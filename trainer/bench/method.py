@@ -37,7 +37,7 @@ from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
 from onedemo.raters import Oracle
 from onedemo.records import Demo
-from onedemo.rollouts import Episodes
+from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
 

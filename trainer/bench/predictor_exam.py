@@ -21,8 +21,8 @@ from onedemo.predictor import Snapshot
 from onedemo.queries.selection import choose
 from onedemo.raters import Oracle
 from onedemo.records import Rollouts, Segment
+from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env
-from onedemo.starts import HeldNoise
 
 STANDING, WILD, OTHERS, ATTEMPTS = "random, standing", "random starts", "other moves", "attempts"
 """The policies whose clips are ranked."""

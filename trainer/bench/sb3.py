@@ -23,10 +23,10 @@ from onedemo.bench.figures import Result, by_turns, ratio
 from onedemo.bench.physics import stock_hopper
 from onedemo.bench.training import LANES, STEPS, one_thread
 from onedemo.core.cpu import cores
-from onedemo.policy import Policy, PolicyConfig
-from onedemo.rollouts import Collector
+from onedemo.rl.policy import Policy, PolicyConfig
+from onedemo.rl.rollouts import Collector
+from onedemo.rl.trpo import Trpo, TrpoConfig
 from onedemo.sim import physics_profiling, vector_env
-from onedemo.trpo import Trpo, TrpoConfig
 
 
 def measure(quick: bool = False) -> list[Result]:

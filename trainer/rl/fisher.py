@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from onedemo.policy import Policy
+from onedemo.rl.policy import Policy
 
 
 def conjugate_gradient(

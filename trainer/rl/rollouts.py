@@ -16,8 +16,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from onedemo.policy import PolicySnapshot
 from onedemo.records import Rollouts
+from onedemo.rl.policy import PolicySnapshot
 from onedemo.sim import vector_env
 
 

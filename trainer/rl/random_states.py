@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.rollouts import Collector, EpisodeRules, Starts, Transitions
+from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import clearances
 

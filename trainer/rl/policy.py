@@ -21,7 +21,14 @@ import torch
 from torch import nn
 
 from onedemo.errors import UserError
-from onedemo.inputs import KINDS, feature_size, policy_inputs, rows_of, state_features, time_features
+from onedemo.rl.policy_inputs import (
+    KINDS,
+    feature_size,
+    policy_inputs,
+    rows_of,
+    state_features,
+    time_features,
+)
 
 _CLIP = 10.0
 """Normalised inputs are clipped to +- this many standard deviations."""

@@ -1,0 +1,1 @@
+"""The policy, what it sees, rollouts and trust region policy optimisation."""
