@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from onedemo.raters import appearance
+from onedemo.annotators.oracle import appearance
 from onedemo.rl.random_states import random_states, wild_rollouts
 from onedemo.sim import kinematics, vector_env
 from onedemo.sim.task_rewards import clearances

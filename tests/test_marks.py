@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from onedemo.annotators.base import Judge
 from onedemo.demos.frame_clock import frame_of_step
-from onedemo.judge import Judge
 from onedemo.marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.records import Segment
 from onedemo.storage.store import NewClip, RatedSegment, Store

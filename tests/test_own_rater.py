@@ -7,12 +7,12 @@ import pytest
 from test_scripted import Untouchable
 from worlds import STEPS, Thumbnail, falling_demo, small_config
 
+from onedemo.annotators.base import RatingBudgetSpent
+from onedemo.annotators.oracle import make_rater
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.headless import train
-from onedemo.judge import RatingBudgetSpent
-from onedemo.raters import make_rater
 from onedemo.records import Segment
 from onedemo.render.clip_image import fit
 from onedemo.render.renderer import Renderer

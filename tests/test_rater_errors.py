@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from onedemo.annotators.base import Judge, RatingBudgetSpent
+from onedemo.annotators.noise import ERRORS, parse_errors
 from onedemo.errors import UserError
-from onedemo.judge import Judge, RatingBudgetSpent
-from onedemo.rater_errors import ERRORS, parse_errors
 from onedemo.records import Segment
 
 N = 2000

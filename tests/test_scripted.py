@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import onedemo
+from onedemo.annotators.oracle import make_rater
+from onedemo.annotators.scripted import Script, load_marks, marked, table_path, visible
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.learner import Learner
-from onedemo.raters import make_rater
 from onedemo.records import Demo, Segment
-from onedemo.scripted import Script, load_marks, marked, table_path, visible
 from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
 
 TABLE = Path(onedemo.__file__).parent / "bench" / "person_backflip.json"

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from onedemo.alignment import align
+from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
-from onedemo.raters import Oracle, appearance
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
 from onedemo.sim import vector_env

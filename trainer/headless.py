@@ -10,6 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from onedemo.annotators.oracle import Oracle, make_rater, marker
 from onedemo.asking import Simulated
 from onedemo.config import RunConfig
 from onedemo.core.files import hold
@@ -19,7 +20,6 @@ from onedemo.evaluation import summarise
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
 from onedemo.predictor import Snapshot
-from onedemo.raters import Oracle, make_rater, marker
 from onedemo.records import Demo
 from onedemo.runs import add_run, find_run, program_version
 from onedemo.storage.store import Store
@@ -47,7 +47,7 @@ def train(
         demo: What is to be learned; the oracle needs its hidden states.
         config: ``ratings.pretrain + ratings.online`` is the rater's budget.
         encoder: Looks at the demo's frames.
-        rater: Name of the simulated rater, see ``onedemo.raters.make_rater``.
+        rater: Name of the simulated rater, see ``onedemo.annotators.oracle.make_rater``.
         name: Of the run; an unfinished run of that name goes on.
         progress: Show a progress bar on standard error.
         cache_dir: Holds what is known of demos and robots; the data directory if None.

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.appearance import Track
 from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
 from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
@@ -27,7 +28,6 @@ from onedemo.errors import UserError
 from onedemo.evaluation import per_episode, perform_policy
 from onedemo.learner import Learner
 from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
-from onedemo.raters import Oracle, appearance
 from onedemo.records import Demo
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from onedemo.annotators.oracle import Oracle
 from onedemo.appearance import learn as learn_appearance
 from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
@@ -35,7 +36,6 @@ from onedemo.evaluation import per_episode, perform, predicted_similarity, sprea
 from onedemo.headless import train
 from onedemo.learner import Learner
 from onedemo.predictor import Snapshot
-from onedemo.raters import Oracle
 from onedemo.records import Demo
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from onedemo.annotators.oracle import Oracle
 from onedemo.bench.predictor_scores import spearman
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.learner import Learner
 from onedemo.practice import fill_bank
 from onedemo.predictor import Snapshot
 from onedemo.queries.selection import choose
-from onedemo.raters import Oracle
 from onedemo.records import Rollouts, Segment
 from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from onedemo import appearance
+from onedemo.annotators.oracle import Oracle
 from onedemo.bench.method import prepare
 from onedemo.bench.predictor_exam import Exam
 from onedemo.bench.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
@@ -27,7 +28,6 @@ from onedemo.demos.library import find_demo
 from onedemo.encoders import demo_features
 from onedemo.learner import Learner
 from onedemo.predictor import CLASSES, Snapshot
-from onedemo.raters import Oracle
 from onedemo.records import Demo
 from onedemo.storage.store import RatedSegment
 

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from onedemo.annotators.base import Judge
+from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
-from onedemo.judge import Judge
-from onedemo.rater_errors import Errors
 from onedemo.records import Demo
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances

@@ -1,7 +1,7 @@
 """Simulated raters, by name. They compare what a person would see; the oracle reads hidden demo states.
 
 ``oracle``, ``script[:TABLE.json]`` or ``package.module:Class``; the first two may be followed by error
-models, ``oracle+mistake:0.1+jitter`` (``onedemo.rater_errors``), and by ``+seed:N``.
+models, ``oracle+mistake:0.1+jitter`` (``onedemo.annotators.noise``), and by ``+seed:N``.
 
 Nothing that learns may import this module or ``onedemo.demos.ground_truth``: a rater sees the demo's states, the
 learner sees nothing but the rating.
@@ -18,13 +18,13 @@ from typing import Protocol
 
 import numpy as np
 
+from onedemo.annotators.base import Judge, RatingBudgetSpent
+from onedemo.annotators.custom import OwnRater
+from onedemo.annotators.noise import Errors, parse_errors
+from onedemo.annotators.scripted import Script, load_marks, table_path
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.judge import Judge, RatingBudgetSpent
-from onedemo.own_rater import OwnRater
-from onedemo.rater_errors import Errors, parse_errors
 from onedemo.records import Demo, Segment
-from onedemo.scripted import Script, load_marks, table_path
 
 __all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appearance", "make_rater"]
 

@@ -1,6 +1,6 @@
 """The rater that measures: a distance at each step of a clip, four thresholds, a budget.
 
-``onedemo.raters.Oracle`` and ``onedemo.scripted.Script`` say what is measured; ``onedemo.rater_errors``
+``onedemo.annotators.oracle.Oracle`` and ``onedemo.annotators.scripted.Script`` say what is measured; ``onedemo.annotators.noise``
 what goes wrong on the way to a rating. Nothing that learns may import this module.
 
 Shapes: W control steps, q = v = 6.
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from onedemo.rater_errors import Errors, Look
+from onedemo.annotators.noise import Errors, Look
 from onedemo.records import Segment
 
 _STREAM = 1511
