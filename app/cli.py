@@ -243,10 +243,10 @@ def _serve(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from onedemo.core.files import write_atomic
     from onedemo.demos.library import find_demo
-    from onedemo.encoders import make_encoder
     from onedemo.headless import train
     from onedemo.storage.store import Store
     from onedemo.transfer import newest_snapshot
+    from onedemo.vision.encoders import make_encoder
 
     config = _config(arguments)
     if arguments.json is not None:

@@ -14,11 +14,11 @@ from onedemo.app.listening import Listening
 from onedemo.app.server import Page
 from onedemo.app.study import Study
 from onedemo.config import RunConfig
-from onedemo.encoders import make_encoder
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
 from onedemo.runs import add_run, find_run
 from onedemo.storage.store import Store
+from onedemo.vision.encoders import make_encoder
 
 _SWITCH_SECONDS = 0.0005
 """A press passes through five threads. Each would wait Python's usual 5 ms for a trainer that computes."""

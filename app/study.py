@@ -12,7 +12,6 @@ from pathlib import Path
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
 from onedemo.core.files import hold
 from onedemo.demos.library import find_demo
-from onedemo.encoders import make_encoder
 from onedemo.errors import UserError
 from onedemo.loop import Trainer
 from onedemo.predictor import Snapshot, check_start
@@ -21,6 +20,7 @@ from onedemo.render.renderer import RenderThread
 from onedemo.runs import add_run, find_run
 from onedemo.storage.store import Store
 from onedemo.transfer import newest_snapshot
+from onedemo.vision.encoders import make_encoder
 
 
 class Study:

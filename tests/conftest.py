@@ -27,13 +27,13 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     The robot is learned from fewer pictures than it is for people: a minute less.
     """
-    from onedemo import appearance
-    from onedemo.encoders import make_encoder
+    from onedemo.vision import pose_estimator
+    from onedemo.vision.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("results")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(appearance, "PICTURES", 1000)
-        appearance.learn("hopper", make_encoder("efficientnet-lite0"), directory / "cache" / "robots")
+        patch.setattr(pose_estimator, "PICTURES", 1000)
+        pose_estimator.learn("hopper", make_encoder("efficientnet-lite0"), directory / "cache" / "robots")
     return directory
 
 
@@ -59,13 +59,13 @@ def chromium() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
-    from onedemo import appearance
-    from onedemo.encoders import make_encoder
+    from onedemo.vision import pose_estimator as appearance
+    from onedemo.vision.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("looked") / "robots"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(appearance, "PICTURES", 300)
-        appearance.learn("hopper", make_encoder("efficientnet-lite0"), directory)
+        patch.setattr(pose_estimator, "PICTURES", 300)
+        pose_estimator.learn("hopper", make_encoder("efficientnet-lite0"), directory)
     return directory
 
 

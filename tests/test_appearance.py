@@ -7,12 +7,12 @@ import pytest
 import torch
 from worlds import FRAME_STEPS, Thumbnail, falling_states
 
-from onedemo import appearance
-from onedemo.appearance import Appearance, learn, pictures, regress
 from onedemo.demos.library import list_demos, stream_frames
-from onedemo.encoders import make_encoder
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 from onedemo.sim import kinematics
+from onedemo.vision import pose_estimator
+from onedemo.vision.encoders import make_encoder
+from onedemo.vision.pose_estimator import Appearance, learn, pictures, regress
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,8 +42,8 @@ def poses():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(appearance, "_EPOCHS", 10)
-    monkeypatch.setattr(appearance, "PICTURES", 60)
+    monkeypatch.setattr(pose_estimator, "_EPOCHS", 10)
+    monkeypatch.setattr(pose_estimator, "PICTURES", 60)
 
 
 @pytest.mark.slow
@@ -142,8 +142,8 @@ def efficientnet():
 def learned(efficientnet, tmp_path_factory):
     """From 300 pictures of the real renderer; a run takes 4,000."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(appearance, "PICTURES", 300)
-        patch.setattr(appearance, "_EPOCHS", 15)
+        patch.setattr(pose_estimator, "PICTURES", 300)
+        patch.setattr(pose_estimator, "_EPOCHS", 15)
         return learn("hopper", efficientnet, tmp_path_factory.mktemp("robots"))
 
 
@@ -211,7 +211,7 @@ def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, mo
         raise AssertionError("it was drawn again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(appearance, "pictures", nothing_is_drawn)
+        patch.setattr(pose_estimator, "pictures", nothing_is_drawn)
         again = learn("hopper", Thumbnail(), tmp_path)
         with pytest.raises(AssertionError, match="drawn again"):
             learn("hopper", Thumbnail(), tmp_path / "elsewhere")

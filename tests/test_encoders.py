@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo import encoders
 from onedemo.demos.library import import_video
 from onedemo.demos.video import write_webm
-from onedemo.encoders import (
+from onedemo.errors import UserError
+from onedemo.vision import encoders
+from onedemo.vision.encoders import (
     EfficientNetLite0,
     Vgg16,
     check_weights,
@@ -19,8 +20,7 @@ from onedemo.encoders import (
     published_lite0,
     vgg16_layers,
 )
-from onedemo.errors import UserError
-from onedemo.folded import Folded, has_fused
+from onedemo.vision.folded import Folded, has_fused
 
 needs_fused = pytest.mark.skipif(not has_fused(), reason="this PyTorch comes without oneDNN")
 

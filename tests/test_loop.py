@@ -12,7 +12,6 @@ import torch
 from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
 import onedemo
-from onedemo.appearance import regress
 from onedemo.asking import Simulated, due_in_round
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.headless import train
@@ -23,6 +22,7 @@ from onedemo.rl.rollouts import EpisodeRules, evaluate
 from onedemo.runs import add_run, find_run
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
+from onedemo.vision.pose_estimator import regress
 
 
 @pytest.fixture(scope="module")
@@ -487,8 +487,8 @@ def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_
 @pytest.fixture
 def few_pictures(monkeypatch):
     """Of the robot, and few random states: enough to see poses by, if badly."""
-    monkeypatch.setattr("onedemo.appearance.PICTURES", 80)
-    monkeypatch.setattr("onedemo.appearance._EPOCHS", 4)
+    monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
+    monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
     monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
     monkeypatch.setattr("onedemo.practice._BANK_TRIES", 500)
 

@@ -122,9 +122,9 @@ def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
 @pytest.fixture
 def view_of_two():
     """Ratings whose marks blame the spin, not the height; and which log weights tell."""
-    from onedemo.appearance import Track
     from onedemo.predictor import View
     from onedemo.sim import kinematics
+    from onedemo.vision.pose_estimator import Track
 
     rng = np.random.default_rng(0)
     still = np.zeros(11)

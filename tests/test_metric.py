@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.appearance import Track
 from onedemo.imagined import track_basis
 from onedemo.metric import MetricSnapshot
 from onedemo.predictor import PredictorConfig, Snapshot, View, fit
@@ -14,6 +13,7 @@ from onedemo.records import Segment
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment
+from onedemo.vision.pose_estimator import Track
 
 STEPS, FRAMES = 38, 60
 WEIGHTS = np.repeat([[1.0], [0.2]], kinematics.POSE, axis=1)

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from onedemo import appearance
 from onedemo.bench import document, predictor_table
 from onedemo.bench.blocks import Bars, Bullets, Chart, Table
 from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
@@ -23,6 +22,7 @@ from onedemo.bench.predictor_trial import VARIANTS, run
 from onedemo.bench.study import Outcome, kind_of
 from onedemo.bench.worker import find_function
 from onedemo.config import load_config
+from onedemo.vision import pose_estimator
 
 # Scores
 
@@ -191,7 +191,7 @@ def test_the_report_of_nothing():
 @pytest.mark.seam
 def test_a_quick_trial_of_both_kinds_of_ratings(tmp_path, monkeypatch):
     # A rougher idea of the robot's looks than the product has: learned from a tenth of the pictures.
-    monkeypatch.setattr(appearance, "PICTURES", 400)
+    monkeypatch.setattr(pose_estimator, "PICTURES", 400)
     made = []
     for job in predictor_table.plan((100,), quick=True):
         result = document.plain(run(dict(job.settings), job.seed, tmp_path / "scratch", tmp_path / "cache"))

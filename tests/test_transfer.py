@@ -8,7 +8,6 @@ from test_predictor import world
 from worlds import FRAMES, falling_demo, small_config
 
 from onedemo.app.cli import main
-from onedemo.appearance import Track
 from onedemo.asking import Simulated
 from onedemo.errors import UserError
 from onedemo.imagined import track_basis
@@ -20,6 +19,7 @@ from onedemo.runs import add_run
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment, Store
 from onedemo.transfer import newest_snapshot
+from onedemo.vision.pose_estimator import Track
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)
 METRIC = PredictorConfig(members=2)

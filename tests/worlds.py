@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from onedemo.appearance import Track
 from onedemo.config import load_config
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, save_hidden
 from onedemo.demos.video import write_webm
@@ -18,6 +17,7 @@ from onedemo.records import Demo
 from onedemo.render.renderer import Renderer
 from onedemo.sim import kinematics, vector_env
 from onedemo.sim.task_rewards import joint_points
+from onedemo.vision.pose_estimator import Track
 
 STEPS = 250
 FRAMES = 60

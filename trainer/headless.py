@@ -15,7 +15,6 @@ from onedemo.asking import Simulated
 from onedemo.config import RunConfig
 from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path, load_hidden
-from onedemo.encoders import Encoder
 from onedemo.evaluation import summarise
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
@@ -23,6 +22,7 @@ from onedemo.predictor import Snapshot
 from onedemo.records import Demo
 from onedemo.runs import add_run, find_run, program_version
 from onedemo.storage.store import Store
+from onedemo.vision.encoders import Encoder
 
 
 def train(

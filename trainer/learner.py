@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.appearance import Track
 from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
@@ -29,6 +28,7 @@ from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.rl.trpo import Trpo
 from onedemo.sim import kinematics, vector_env
 from onedemo.storage.store import RatedSegment
+from onedemo.vision.pose_estimator import Track
 
 _RANDOM_LANES = 16
 _WILD_LANES = 64

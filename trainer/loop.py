@@ -20,8 +20,6 @@ import numpy as np
 import torch
 
 from onedemo import gallery
-from onedemo.appearance import Track
-from onedemo.appearance import learn as learn_appearance
 from onedemo.asking import Asking, Simulated
 from onedemo.checkpoint import load_checkpoint, save_checkpoint
 from onedemo.clipmaker import ClipMaker
@@ -29,7 +27,6 @@ from onedemo.config import RunConfig
 from onedemo.core.cpu import give_way
 from onedemo.core.files import read_whole
 from onedemo.demos.library import read_frames
-from onedemo.encoders import Encoder, demo_features
 from onedemo.errors import in_words
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing
@@ -43,6 +40,9 @@ from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.store import Store
 from onedemo.training_set import TrainingSet
 from onedemo.transfer import keep_start, snapshot_file
+from onedemo.vision.encoders import Encoder, demo_features
+from onedemo.vision.pose_estimator import Track
+from onedemo.vision.pose_estimator import learn as learn_appearance
 
 log = logging.getLogger("onedemo")
 

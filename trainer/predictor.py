@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from onedemo.appearance import Track
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
 from onedemo.storage.store import RatedSegment
+from onedemo.vision.pose_estimator import Track
 
 CLASSES = 5
 KINDS = {"network": "onedemo.network", "metric": "onedemo.metric"}

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from onedemo.annotators.oracle import Oracle, appearance
-from onedemo.appearance import Track
 from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
 from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
 from onedemo.baselines.scores import Score
@@ -32,6 +31,7 @@ from onedemo.records import Demo
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig
 from onedemo.sim import kinematics, vector_env
+from onedemo.vision.pose_estimator import Track
 
 _TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}
 """Those that made the built-in demos."""

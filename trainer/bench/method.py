@@ -24,14 +24,12 @@ from typing import Any
 import numpy as np
 
 from onedemo.annotators.oracle import Oracle
-from onedemo.appearance import learn as learn_appearance
 from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
 from onedemo.core.files import hold
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
 from onedemo.demos.library import find_demo
-from onedemo.encoders import demo_features, make_encoder
 from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
 from onedemo.headless import train
 from onedemo.learner import Learner
@@ -40,6 +38,8 @@ from onedemo.records import Demo
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
+from onedemo.vision.encoders import demo_features, make_encoder
+from onedemo.vision.pose_estimator import learn as learn_appearance
 
 POINTS = 12
 """Of a learning curve."""

@@ -21,12 +21,12 @@ from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, rat
 from onedemo.config import PredictorConfig
 from onedemo.demos.library import find_demo, read_frames
 from onedemo.demos.video import write_webm
-from onedemo.encoders import EfficientNetLite0, demo_features, published_lite0
 from onedemo.errors import UserError
-from onedemo.folded import SIDE
 from onedemo.predictor import visual_inputs
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
+from onedemo.vision.encoders import EfficientNetLite0, demo_features, published_lite0
+from onedemo.vision.folded import SIDE
 
 _CLIP = 10  # pictures
 _WIDTH, _HEIGHT = 320, 240
@@ -41,7 +41,7 @@ import sys, time
 from pathlib import Path
 from typing import Any, TypeVar
 from onedemo.demos.library import find_demo
-from onedemo.encoders import demo_features, make_encoder
+from onedemo.vision.encoders import demo_features, make_encoder
 demo = find_demo(sys.argv[1], Path(sys.argv[2]))
 began = time.perf_counter()
 demo_features(demo, make_encoder("efficientnet-lite0"), Path(sys.argv[2]))

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from onedemo import appearance
 from onedemo.annotators.oracle import Oracle
 from onedemo.bench.method import prepare
 from onedemo.bench.predictor_exam import Exam
@@ -25,11 +24,12 @@ from onedemo.bench.predictor_scores import calibration_error, confusion, f1, mac
 from onedemo.config import load_config
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
-from onedemo.encoders import demo_features
 from onedemo.learner import Learner
 from onedemo.predictor import CLASSES, Snapshot
 from onedemo.records import Demo
 from onedemo.storage.store import RatedSegment
+from onedemo.vision import pose_estimator
+from onedemo.vision.encoders import demo_features
 
 _NETWORK = {"method": "paper"}
 _ONE_LAYER_LESS = _NETWORK | {"predictor.additional_layer": False}
@@ -183,12 +183,12 @@ def unseen(
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Scene:
     features: np.ndarray
-    track: appearance.Track
+    track: pose_estimator.Track
 
 
 def _look(demo: Demo, kept: Path) -> _Scene:
     """What onedemo sees of a demo: frame features, and poses in them."""
     encoder = prepare(demo, load_config(), kept)  # one job at a time
     features = demo_features(demo, encoder, kept / "demos")
-    look = appearance.learn(load_config().env, encoder, kept / "robots")
+    look = pose_estimator.learn(load_config().env, encoder, kept / "robots")
     return _Scene(features=features, track=look.track(features, demo.fps))

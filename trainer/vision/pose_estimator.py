@@ -23,10 +23,10 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
-from onedemo.encoders import Encoder
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics, vector_env
+from onedemo.vision.encoders import Encoder
 
 PICTURES = 4000
 _SEED = 20_000
