@@ -244,8 +244,8 @@ def _train(arguments: argparse.Namespace) -> None:
     from onedemo.core.files import write_atomic
     from onedemo.demos.library import find_demo
     from onedemo.headless import train
+    from onedemo.reward.warm_start import newest_snapshot
     from onedemo.storage.store import Store
-    from onedemo.transfer import newest_snapshot
     from onedemo.vision.encoders import make_encoder
 
     config = _config(arguments)

@@ -14,8 +14,8 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 
 from onedemo.app.assignment import Ask, Assignment, Seat, to_repeat, to_share
-from onedemo.marks import seconds_of_pictures
 from onedemo.records import Rater
+from onedemo.reward.segment_marks import seconds_of_pictures
 from onedemo.storage.store import Store
 
 GUARD_SECONDS = 0.3

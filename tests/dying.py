@@ -21,11 +21,11 @@ import torch
 import worlds
 
 import onedemo.learner
-import onedemo.practice
+import onedemo.reward.episode_rules
 from onedemo.core import files
 from onedemo.headless import train
-from onedemo.predictor import Snapshot
 from onedemo.records import Demo
+from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
 
 MOMENTS = {

@@ -32,8 +32,8 @@ from onedemo.bench.serving import reach, serving
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
-from onedemo.predictor import Snapshot
 from onedemo.render.clip_image import compose_clip
+from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")

@@ -16,9 +16,9 @@ from onedemo.asking import Simulated
 from onedemo.config import load_config
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
+from onedemo.reward.dataset import TrainingSet
 from onedemo.runs import add_run
 from onedemo.storage.store import RATING_COLUMNS, Store
-from onedemo.training_set import TrainingSet
 
 
 def by_rule(segment, demo_step):

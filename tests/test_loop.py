@@ -16,8 +16,8 @@ from onedemo.asking import Simulated, due_in_round
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.headless import train
 from onedemo.loop import Trainer
-from onedemo.metric import MetricSnapshot
-from onedemo.practice import PracticeRules
+from onedemo.reward.episode_rules import PracticeRules
+from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import EpisodeRules, evaluate
 from onedemo.runs import add_run, find_run
 from onedemo.sim import vector_env
@@ -207,7 +207,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
 def few_wild(monkeypatch):
     """Random states are drawn and tried in seconds."""
     monkeypatch.setattr("onedemo.learner._WILD_LANES", 4)
-    monkeypatch.setattr("onedemo.practice._BANK_TRIES", 200)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 200)
 
 
 @pytest.mark.slow
@@ -490,7 +490,7 @@ def few_pictures(monkeypatch):
     monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
     monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
     monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.practice._BANK_TRIES", 500)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 500)
 
 
 ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}

@@ -8,10 +8,10 @@ import pytest
 
 from onedemo.annotators.base import Judge
 from onedemo.demos.frame_clock import frame_of_step
-from onedemo.marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.records import Segment
+from onedemo.reward.dataset import TrainingSet
+from onedemo.reward.segment_marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.storage.store import NewClip, RatedSegment, Store
-from onedemo.training_set import TrainingSet
 
 W = 20
 
@@ -108,8 +108,8 @@ def test_a_simulated_rater_marks_the_worst_stretch(distances, mark):
 
 def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
     """Each clip is off in one number in its first half and in another in its second; all are rated alike."""
-    from onedemo.metric import fit
-    from onedemo.predictor import PredictorConfig
+    from onedemo.reward.learned_distance import fit
+    from onedemo.reward.model import PredictorConfig
 
     ratings, frames, view, weight_of = view_of_two
     config = PredictorConfig(members=1)
@@ -122,7 +122,7 @@ def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
 @pytest.fixture
 def view_of_two():
     """Ratings whose marks blame the spin, not the height; and which log weights tell."""
-    from onedemo.predictor import View
+    from onedemo.reward.model import View
     from onedemo.sim import kinematics
     from onedemo.vision.pose_estimator import Track
 

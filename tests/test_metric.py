@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.imagined import track_basis
-from onedemo.metric import MetricSnapshot
-from onedemo.predictor import PredictorConfig, Snapshot, View, fit
 from onedemo.records import Segment
+from onedemo.reward.latent_track import track_basis
+from onedemo.reward.learned_distance import MetricSnapshot
+from onedemo.reward.model import PredictorConfig, Snapshot, View, fit
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.practice import Bank, PracticeConfig, PracticeRules, fill_bank
-from onedemo.predictor import PredictorConfig, Snapshot
+from onedemo.reward.episode_rules import Bank, PracticeConfig, PracticeRules, fill_bank
+from onedemo.reward.model import PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.rl.rollouts import Collector, Step

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.network import SimilarityNet, class_weights, standard_inputs
-from onedemo.predictor import PredictorConfig, Snapshot, View, fit, visual_inputs
 from onedemo.records import Segment
+from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, visual_inputs
+from onedemo.reward.two_branch_net import SimilarityNet, class_weights, standard_inputs
 from onedemo.storage.store import RatedSegment
 
 FRAMES = 60

@@ -10,15 +10,15 @@ from worlds import FRAMES, falling_demo, small_config
 from onedemo.app.cli import main
 from onedemo.asking import Simulated
 from onedemo.errors import UserError
-from onedemo.imagined import track_basis
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
-from onedemo.predictor import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.records import Segment
+from onedemo.reward.latent_track import track_basis
+from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
+from onedemo.reward.warm_start import newest_snapshot
 from onedemo.runs import add_run
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment, Store
-from onedemo.transfer import newest_snapshot
 from onedemo.vision.pose_estimator import Track
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)

@@ -14,8 +14,8 @@ from onedemo.clipmaker import ClipMaker
 from onedemo.config import RunConfig
 from onedemo.errors import UserError
 from onedemo.learner import Learner
-from onedemo.predictor import Snapshot
 from onedemo.records import Clip, Rollouts, Segment
+from onedemo.reward.model import Snapshot
 from onedemo.storage.store import NewClip, Store
 
 _FULL = 2 / 3

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 from onedemo.errors import UserError
-from onedemo.practice import PracticeConfig
-from onedemo.predictor import PredictorConfig
 from onedemo.queries.selection import CHOICES
+from onedemo.reward.episode_rules import PracticeConfig
+from onedemo.reward.model import PredictorConfig
 from onedemo.rl.policy import PolicyConfig
 from onedemo.rl.trpo import TrpoConfig
 

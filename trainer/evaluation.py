@@ -12,7 +12,7 @@ import numpy as np
 from onedemo.alignment import align
 from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.learner import Learner
-from onedemo.predictor import Snapshot
+from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
 from onedemo.sim import vector_env

@@ -18,8 +18,8 @@ from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.evaluation import summarise
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
-from onedemo.predictor import Snapshot
 from onedemo.records import Demo
+from onedemo.reward.model import Snapshot
 from onedemo.runs import add_run, find_run, program_version
 from onedemo.storage.store import Store
 from onedemo.vision.encoders import Encoder
@@ -52,7 +52,7 @@ def train(
         progress: Show a progress bar on standard error.
         cache_dir: Holds what is known of demos and robots; the data directory if None.
         watch: Called with learner and snapshot after each iteration, for a learning curve.
-        start: Snapshot of another run that the predictor starts from, see ``onedemo.transfer``.
+        start: Snapshot of another run that the predictor starts from, see ``onedemo.reward.warm_start``.
 
     Returns:
         The summary, ready for JSON: ratings, figures over 16 episodes of the final policy, costs.

@@ -17,11 +17,11 @@ import numpy as np
 from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
-from onedemo.imagined import track_basis
-from onedemo.practice import PracticeRules, fill_bank
-from onedemo.predictor import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.queries.selection import Question, choose
 from onedemo.records import Rollouts, Segment
+from onedemo.reward.episode_rules import PracticeRules, fill_bank
+from onedemo.reward.latent_track import track_basis
+from onedemo.reward.model import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.rl.policy import Policy, PolicySnapshot, check_device
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions

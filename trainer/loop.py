@@ -30,16 +30,16 @@ from onedemo.demos.library import read_frames
 from onedemo.errors import in_words
 from onedemo.learner import Learner
 from onedemo.pairing import Pairing
-from onedemo.predictor import Snapshot
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render.renderer import RenderThread
+from onedemo.reward.dataset import TrainingSet
+from onedemo.reward.model import Snapshot
+from onedemo.reward.warm_start import keep_start, snapshot_file
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.store import Store
-from onedemo.training_set import TrainingSet
-from onedemo.transfer import keep_start, snapshot_file
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import Track
 from onedemo.vision.pose_estimator import learn as learn_appearance

@@ -26,8 +26,8 @@ from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation import per_episode, perform_policy
 from onedemo.learner import Learner
-from onedemo.predictor import CLASSES, PredictorConfig, Snapshot
 from onedemo.records import Demo
+from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig
 from onedemo.sim import kinematics, vector_env

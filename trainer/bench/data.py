@@ -23,9 +23,9 @@ import numpy as np
 
 from onedemo.bench.figures import Growth, Result, single
 from onedemo.records import Segment
+from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.segment_codec import pack_segment
 from onedemo.storage.store import Store
-from onedemo.training_set import TrainingSet
 
 _RUN = "bench"
 _RATERS, _ITERATIONS, _WAITING = 50, 500, 20

@@ -33,8 +33,8 @@ from onedemo.demos.library import find_demo
 from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
 from onedemo.headless import train
 from onedemo.learner import Learner
-from onedemo.predictor import Snapshot
 from onedemo.records import Demo
+from onedemo.reward.model import Snapshot
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store

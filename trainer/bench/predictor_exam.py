@@ -17,10 +17,10 @@ from onedemo.annotators.oracle import Oracle
 from onedemo.bench.predictor_scores import spearman
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.learner import Learner
-from onedemo.practice import fill_bank
-from onedemo.predictor import Snapshot
 from onedemo.queries.selection import choose
 from onedemo.records import Rollouts, Segment
+from onedemo.reward.episode_rules import fill_bank
+from onedemo.reward.model import Snapshot
 from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env
 

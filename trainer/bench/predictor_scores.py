@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from onedemo.predictor import CLASSES
+from onedemo.reward.model import CLASSES
 
 BINS = 10
 """Of a reliability chart, equally wide."""

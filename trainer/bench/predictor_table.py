@@ -46,7 +46,7 @@ from onedemo.bench.predictor_scores import BINS, interval
 from onedemo.bench.predictor_trial import VARIANTS
 from onedemo.bench.seeds import spread
 from onedemo.bench.study import Job, Outcome, by_label
-from onedemo.predictor import CLASSES
+from onedemo.reward.model import CLASSES
 
 TITLE = "onedemo: how well ratings are predicted (Table 1)"
 SEEDS = 5

@@ -18,8 +18,8 @@ from onedemo.bench.physics import Bare, full_states
 from onedemo.config import RunConfig, load_config
 from onedemo.core.cpu import cores
 from onedemo.learner import Learner
-from onedemo.predictor import Snapshot
 from onedemo.records import Rollouts
+from onedemo.reward.model import Snapshot
 from onedemo.storage.store import RatedSegment
 
 LANES, STEPS = 64, 250

@@ -17,8 +17,8 @@ from onedemo.bench import method
 from onedemo.bench.study import Job
 from onedemo.demos.library import find_demo
 from onedemo.headless import train
+from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.store import Store
-from onedemo.transfer import newest_snapshot
 
 _RUN = "source"
 

@@ -20,8 +20,8 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo.errors import UserError
-from onedemo.marks import split_marks
-from onedemo.predictor import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
+from onedemo.reward.model import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
+from onedemo.reward.segment_marks import split_marks
 from onedemo.storage.store import RatedSegment
 
 STANDARD_DIMS = 15

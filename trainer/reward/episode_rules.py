@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from onedemo.predictor import CLASSES, Snapshot
+from onedemo.reward.model import CLASSES, Snapshot
 from onedemo.rl.rollouts import EpisodeRules, Rollouts, Starts, Step
 
 _MOVES = np.arange(4)

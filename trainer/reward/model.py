@@ -1,7 +1,7 @@
 """The similarity predictor: from a demo frame and a robot's state and action to a rating of 1 to 5.
 
 Here is what all kinds have in common: settings, what they see of the demo, and the snapshot that a fit
-gives. ``trainer/network.py`` is the paper's network, ``trainer/metric.py`` a learned distance.
+gives. ``trainer/reward/two_branch_net.py`` is the paper's network, ``trainer/reward/learned_distance.py`` a learned distance.
 
 Shapes: n clips, W control steps a clip, F demo frames, D frame features, V visual dims.
 """
@@ -25,7 +25,7 @@ from onedemo.storage.store import RatedSegment
 from onedemo.vision.pose_estimator import Track
 
 CLASSES = 5
-KINDS = {"network": "onedemo.network", "metric": "onedemo.metric"}
+KINDS = {"network": "onedemo.reward.two_branch_net", "metric": "onedemo.reward.learned_distance"}
 """Kind to module; each has ``fit(...)`` as below and ``restore(data, config, device)``."""
 _FAR = 5.0
 """Standard deviations beyond which a visual input of another demo is no farther."""
@@ -116,7 +116,7 @@ class View:
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
     basis: np.ndarray
-    """Functions of the frames that an unknown track is made of (``trainer/imagined.py``), (F, R), float32."""
+    """Functions of the frames that an unknown track is made of (``trainer/reward/latent_track.py``), (F, R), float32."""
     fps: float
     """Frames per second."""
     lens: Lens | None = None

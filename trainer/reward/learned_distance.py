@@ -11,7 +11,7 @@ of a clip as wrong, that part is taken to be further off than the rest, with the
 sigmoid(g (mean of d inside - mean outside)). Where the track is seen
 (``trainer/vision/pose_estimator.py``) that is 23 numbers, so a few dozen ratings fit it; a network of thousands has
 to learn first that near is like. Where it is not, the track itself is fitted to the ratings, too
-(``trainer/imagined.py``).
+(``trainer/reward/latent_track.py``).
 
 A fit that starts from the numbers of another move (they say what the rater looks at, not what the demo
 shows) is pulled to them, the less the more ratings there are.
@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from onedemo.imagined import track_of
-from onedemo.marks import marked_steps
-from onedemo.predictor import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from onedemo.reward.latent_track import track_of
+from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from onedemo.reward.segment_marks import marked_steps
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from onedemo.predictor import visual_inputs
+from onedemo.reward.model import visual_inputs
 from onedemo.sim import kinematics
 
 _DIMS = 8
