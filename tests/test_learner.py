@@ -4,7 +4,7 @@ import torch
 from worlds import FRAMES, STEPS, falling_states, falling_track, small_config
 
 from onedemo.errors import UserError
-from onedemo.evaluation import summarise
+from onedemo.evaluation.episodes import summarise
 from onedemo.learner import Learner
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import evaluate

@@ -15,7 +15,7 @@ from onedemo.asking import Simulated
 from onedemo.config import RunConfig
 from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path, load_hidden
-from onedemo.evaluation import summarise
+from onedemo.evaluation.episodes import summarise
 from onedemo.learner import Learner
 from onedemo.loop import Trainer
 from onedemo.records import Demo

@@ -24,7 +24,7 @@ from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
-from onedemo.evaluation import per_episode, perform_policy
+from onedemo.evaluation.episodes import per_episode, perform_policy
 from onedemo.learner import Learner
 from onedemo.records import Demo
 from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot

@@ -30,7 +30,7 @@ from onedemo.core.files import hold
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
 from onedemo.demos.library import find_demo
-from onedemo.evaluation import per_episode, perform, predicted_similarity, spread, state_errors
+from onedemo.evaluation.episodes import per_episode, perform, predicted_similarity, spread, state_errors
 from onedemo.headless import train
 from onedemo.learner import Learner
 from onedemo.records import Demo

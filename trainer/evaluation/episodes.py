@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.alignment import align
 from onedemo.annotators.oracle import Oracle, appearance
+from onedemo.evaluation.time_warping import align
 from onedemo.learner import Learner
 from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
@@ -142,7 +142,7 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     """How like the demo episodes are if being early or late does not count, up to ``ALIGN_SECONDS``.
 
     Each episode is laid along the demo by dynamic time warping on the oracle's distance
-    (``onedemo.alignment``); then every moment of the demo is rated against the episode's moment beside it.
+    (``onedemo.evaluation.time_warping``); then every moment of the demo is rated against the episode's moment beside it.
 
     Args:
         qpos: Positions, (N, T, q).

@@ -1,0 +1,1 @@
+"""What a trained policy is worth: whole episodes against the demo's ground truth."""
