@@ -8,8 +8,8 @@ from typing import Any
 from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
 from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.words import ANSWERS
-from onedemo.runs import program_version
 from onedemo.storage.store import Store
+from onedemo.training.runs import program_version
 
 
 def card(store: Store, run: str | None = None, *, now: datetime | None = None) -> str:
@@ -38,7 +38,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         "## Columns of the ratings (CSV)\n\nUTF-8, one header, one row a rating that holds. A text that a "
         "spreadsheet would take for a formula begins with an apostrophe.\n\n" + as_table(RATINGS),
         "## Columns of the segments (Parquet)\n\nOne row a rated clip, key `clip_id`. The file's metadata "
-        "`onedemo.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
+        "`onedemo.training.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
         "## Columns of the comparisons (CSV)\n\nAnswers to *Which of the two is nearer to the video?*\n\n"
         + as_table(COMPARISONS),
         "## Limits\n\n"

@@ -243,9 +243,9 @@ def _serve(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     from onedemo.core.files import write_atomic
     from onedemo.demos.library import find_demo
-    from onedemo.headless import train
     from onedemo.reward.warm_start import newest_snapshot
     from onedemo.storage.store import Store
+    from onedemo.training.simulated_run import train
     from onedemo.vision.encoders import make_encoder
 
     config = _config(arguments)

@@ -16,7 +16,7 @@ from onedemo.errors import UserError
 from onedemo.records import ROLES, Clip, Segment
 
 _ARRAYS = ("obs", "actions", "qpos", "qvel")
-_RUNS, _ROLES = b"onedemo.runs", b"onedemo.annotators.oracle"
+_RUNS, _ROLES = b"onedemo.training.runs", b"onedemo.annotators.oracle"
 _GROUP = 500
 """Clips that are in memory at a time."""
 

@@ -16,8 +16,8 @@ from onedemo.app.study import Study
 from onedemo.config import RunConfig
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
-from onedemo.runs import add_run, find_run
 from onedemo.storage.store import Store
+from onedemo.training.runs import add_run, find_run
 from onedemo.vision.encoders import make_encoder
 
 _SWITCH_SECONDS = 0.0005

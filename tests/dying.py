@@ -20,13 +20,13 @@ from typing import Any
 import torch
 import worlds
 
-import onedemo.learner
 import onedemo.reward.episode_rules
+import onedemo.training.learner
 from onedemo.core import files
-from onedemo.headless import train
 from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
+from onedemo.training.simulated_run import train
 
 MOMENTS = {
     "amid the first ratings": ("store", "rate", 2, True),

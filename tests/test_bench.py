@@ -133,7 +133,7 @@ def test_quick_run_of_physics_and_training(tmp_path, capsys):
 def test_made_up_ratings_are_skewed_like_those_of_a_random_policy():
     from onedemo.bench.training import made_up_ratings
     from onedemo.config import load_config
-    from onedemo.learner import Learner
+    from onedemo.training.learner import Learner
 
     learner = Learner(load_config(None, {"method": "paper"}), 240, 30.0)
     ratings = made_up_ratings(learner.random_rollouts(), 200, learner.clip_steps)

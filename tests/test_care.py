@@ -25,7 +25,6 @@ from worlds import falling_demo, small_config
 
 from onedemo.app.cli import main
 from onedemo.app.links import read_secret
-from onedemo.asking import Simulated
 from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.bench.annotators import browser_session, open_tab, rating
 from onedemo.bench.serving import reach, serving
@@ -35,6 +34,7 @@ from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
+from onedemo.training.rating_queue import Simulated
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
 

@@ -9,8 +9,8 @@ from worlds import falling_demo, falling_states
 
 from onedemo.app.progress import chosen, gallery_html, timeline_html
 from onedemo.demos.video import VideoReader, count_frames
-from onedemo.gallery import PARTS, Episode, Gallery
 from onedemo.render.renderer import RenderThread
+from onedemo.training.best_rollouts import PARTS, Episode, Gallery
 
 
 class ByLane:

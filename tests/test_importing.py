@@ -12,13 +12,13 @@ from worlds import Thumbnail, falling_demo, small_config
 from onedemo.app.card import card
 from onedemo.app.cli import main
 from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
-from onedemo.asking import Simulated
 from onedemo.config import load_config
-from onedemo.learner import Learner
-from onedemo.loop import Trainer
 from onedemo.reward.dataset import TrainingSet
-from onedemo.runs import add_run
 from onedemo.storage.store import RATING_COLUMNS, Store
+from onedemo.training.learner import Learner
+from onedemo.training.rating_queue import Simulated
+from onedemo.training.runs import add_run
+from onedemo.training.trainer import Trainer
 
 
 def by_rule(segment, demo_step):

@@ -5,10 +5,10 @@ from worlds import FRAMES, STEPS, falling_states, falling_track, small_config
 
 from onedemo.errors import UserError
 from onedemo.evaluation.episodes import summarise
-from onedemo.learner import Learner
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import evaluate
 from onedemo.storage.store import RatedSegment
+from onedemo.training.learner import Learner
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def features():
 @pytest.fixture(autouse=True)
 def few_random_states(monkeypatch):
     """A run draws 61,440 of them, which takes a while."""
-    monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
+    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
     monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 1000)
     torch.set_num_threads(1)  # as a run does
 

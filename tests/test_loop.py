@@ -12,16 +12,16 @@ import torch
 from worlds import Thumbnail, drawn_demo, falling_demo, small_config
 
 import onedemo
-from onedemo.asking import Simulated, due_in_round
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
-from onedemo.headless import train
-from onedemo.loop import Trainer
 from onedemo.reward.episode_rules import PracticeRules
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import EpisodeRules, evaluate
-from onedemo.runs import add_run, find_run
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
+from onedemo.training.rating_queue import Simulated, due_in_round
+from onedemo.training.runs import add_run, find_run
+from onedemo.training.simulated_run import train
+from onedemo.training.trainer import Trainer
 from onedemo.vision.pose_estimator import regress
 
 
@@ -189,7 +189,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
         raise FloatingPointError("the policy has exploded")
 
     with monkeypatch.context() as broken:
-        broken.setattr("onedemo.learner.Learner.iterate", break_down)
+        broken.setattr("onedemo.training.learner.Learner.iterate", break_down)
         trainer_.start()
         wait_for(lambda: rate_all(store, "r", ann) or trainer_.status().phase == "failed")
         assert trainer_.status().error == "FloatingPointError: the policy has exploded"
@@ -206,7 +206,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
 @pytest.fixture
 def few_wild(monkeypatch):
     """Random states are drawn and tried in seconds."""
-    monkeypatch.setattr("onedemo.learner._WILD_LANES", 4)
+    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 4)
     monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 200)
 
 
@@ -223,7 +223,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
             rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
         )
 
-    monkeypatch.setattr("onedemo.loop.learn_appearance", look)
+    monkeypatch.setattr("onedemo.training.trainer.learn_appearance", look)
     trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
     trainer_.start()
     for _ in range(3):
@@ -489,7 +489,7 @@ def few_pictures(monkeypatch):
     """Of the robot, and few random states: enough to see poses by, if badly."""
     monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
     monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
-    monkeypatch.setattr("onedemo.learner._WILD_LANES", 8)
+    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
     monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 500)
 
 

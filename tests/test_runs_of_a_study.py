@@ -8,14 +8,14 @@ from worlds import Thumbnail, falling_demo, small_config
 from onedemo.app import study as module
 from onedemo.app.actions import Actions
 from onedemo.app.study import Study
-from onedemo.asking import Simulated
 from onedemo.core.files import hold
 from onedemo.errors import UserError
-from onedemo.loop import Trainer
 from onedemo.records import Rater
 from onedemo.render.renderer import RenderThread
-from onedemo.runs import add_run
 from onedemo.storage.store import Store
+from onedemo.training.rating_queue import Simulated
+from onedemo.training.runs import add_run
+from onedemo.training.trainer import Trainer
 
 pytestmark = pytest.mark.seam
 

@@ -8,17 +8,17 @@ from test_predictor import world
 from worlds import FRAMES, falling_demo, small_config
 
 from onedemo.app.cli import main
-from onedemo.asking import Simulated
 from onedemo.errors import UserError
-from onedemo.learner import Learner
-from onedemo.loop import Trainer
 from onedemo.records import Segment
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.reward.warm_start import newest_snapshot
-from onedemo.runs import add_run
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment, Store
+from onedemo.training.learner import Learner
+from onedemo.training.rating_queue import Simulated
+from onedemo.training.runs import add_run
+from onedemo.training.trainer import Trainer
 from onedemo.vision.pose_estimator import Track
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)

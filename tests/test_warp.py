@@ -12,12 +12,12 @@ import pytest
 from onedemo.bench.figures import Skipped
 from onedemo.config import load_config
 from onedemo.errors import UserError
-from onedemo.learner import Learner
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.rl.trpo import Trpo, TrpoConfig
 from onedemo.sim import vector_env
 from onedemo.sim.physics import RolloutPhysics, load_model
+from onedemo.training.learner import Learner
 
 pytest.importorskip("mujoco_warp", reason="the extra 'warp' is not installed: pip install 'onedemo[warp]'")
 

@@ -9,8 +9,8 @@ import numpy as np
 from onedemo.bench.figures import Growth, Result, single
 from onedemo.bench.training import learner_and_snapshot, made_up_ratings, one_thread
 from onedemo.config import load_config
-from onedemo.learner import Learner
 from onedemo.storage.store import RatedSegment
+from onedemo.training.learner import Learner
 
 _DISTINCT = 350
 

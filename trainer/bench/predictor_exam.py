@@ -16,13 +16,13 @@ import numpy as np
 from onedemo.annotators.oracle import Oracle
 from onedemo.bench.predictor_scores import spearman
 from onedemo.demos.ground_truth import HiddenStates
-from onedemo.learner import Learner
 from onedemo.queries.selection import choose
 from onedemo.records import Rollouts, Segment
 from onedemo.reward.episode_rules import fill_bank
 from onedemo.reward.model import Snapshot
 from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env
+from onedemo.training.learner import Learner
 
 STANDING, WILD, OTHERS, ATTEMPTS = "random, standing", "random starts", "other moves", "attempts"
 """The policies whose clips are ranked."""

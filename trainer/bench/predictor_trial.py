@@ -24,10 +24,10 @@ from onedemo.bench.predictor_scores import calibration_error, confusion, f1, mac
 from onedemo.config import load_config
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
-from onedemo.learner import Learner
 from onedemo.records import Demo
 from onedemo.reward.model import CLASSES, Snapshot
 from onedemo.storage.store import RatedSegment
+from onedemo.training.learner import Learner
 from onedemo.vision import pose_estimator
 from onedemo.vision.encoders import demo_features
 

@@ -16,9 +16,9 @@ from typing import Any
 from onedemo.bench import method
 from onedemo.bench.study import Job
 from onedemo.demos.library import find_demo
-from onedemo.headless import train
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.store import Store
+from onedemo.training.simulated_run import train
 
 _RUN = "source"
 

@@ -1,6 +1,6 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
-Evaluation may read hidden demo states; nothing in ``onedemo.learner`` or ``onedemo.loop`` may.
+Evaluation may read hidden demo states; nothing in ``onedemo.training.learner`` or ``onedemo.training.trainer`` may.
 
 Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
@@ -11,7 +11,6 @@ import numpy as np
 
 from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.evaluation.time_warping import align
-from onedemo.learner import Learner
 from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
@@ -26,6 +25,7 @@ from onedemo.sim.task_rewards import (
     turned,
     until_fall,
 )
+from onedemo.training.learner import Learner
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from onedemo.clipmaker import ClipMaker
 from onedemo.config import RunConfig
 from onedemo.errors import UserError
-from onedemo.learner import Learner
 from onedemo.records import Clip, Rollouts, Segment
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import NewClip, Store
+from onedemo.training.clip_worker import ClipMaker
+from onedemo.training.learner import Learner
 
 _FULL = 2 / 3
 """Share of the queue that waits before it is filled up for people."""

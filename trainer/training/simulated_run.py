@@ -11,17 +11,17 @@ from typing import Any
 from tqdm import tqdm
 
 from onedemo.annotators.oracle import Oracle, make_rater, marker
-from onedemo.asking import Simulated
 from onedemo.config import RunConfig
 from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.evaluation.episodes import summarise
-from onedemo.learner import Learner
-from onedemo.loop import Trainer
 from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
-from onedemo.runs import add_run, find_run, program_version
 from onedemo.storage.store import Store
+from onedemo.training.learner import Learner
+from onedemo.training.rating_queue import Simulated
+from onedemo.training.runs import add_run, find_run, program_version
+from onedemo.training.trainer import Trainer
 from onedemo.vision.encoders import Encoder
 
 

@@ -19,17 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from onedemo import gallery
-from onedemo.asking import Asking, Simulated
-from onedemo.checkpoint import load_checkpoint, save_checkpoint
-from onedemo.clipmaker import ClipMaker
 from onedemo.config import RunConfig
 from onedemo.core.cpu import give_way
 from onedemo.core.files import read_whole
 from onedemo.demos.library import read_frames
 from onedemo.errors import in_words
-from onedemo.learner import Learner
-from onedemo.pairing import Pairing
 from onedemo.records import Demo, Rollouts, Status
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.dataset import TrainingSet
@@ -40,6 +34,12 @@ from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.store import Store
+from onedemo.training import best_rollouts
+from onedemo.training.checkpoint import load_checkpoint, save_checkpoint
+from onedemo.training.clip_worker import ClipMaker
+from onedemo.training.comparison_queue import Pairing
+from onedemo.training.learner import Learner
+from onedemo.training.rating_queue import Asking, Simulated
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import Track
 from onedemo.vision.pose_estimator import learn as learn_appearance
@@ -105,7 +105,7 @@ class Trainer:
         self._pairing: Pairing | None = None
         self._gallery = None
         if renderer is not None:
-            self._gallery = gallery.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
+            self._gallery = best_rollouts.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
         self._asking = Asking(store, run, config, simulated)
         self._training_set = TrainingSet(store, run, self.dt)
         self._pool: Rollouts | None = None

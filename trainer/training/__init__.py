@@ -1,0 +1,1 @@
+"""One training run: learner, trainer and its thread, queues of clips, checkpoints."""
