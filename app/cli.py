@@ -313,7 +313,7 @@ def _demo_show(arguments: argparse.Namespace) -> None:
 def _baseline_trpo(arguments: argparse.Namespace) -> None:
     from dataclasses import asdict
 
-    from onedemo.baselines.handcoded import HandcodedConfig, save_result, train_handcoded
+    from onedemo.baselines.handcoded_trpo import HandcodedConfig, save_result, train_handcoded
 
     lanes = max(1, arguments.lanes)
     config = HandcodedConfig(

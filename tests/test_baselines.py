@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.baselines import handcoded, trajopt
+from onedemo.baselines import handcoded_trpo, trajectory_search
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.errors import UserError
 from onedemo.rl.policy import Policy, PolicyConfig
@@ -38,16 +38,16 @@ def one_thread():
 
 def tiny(task="backflip", **options):
     defaults = {"steps": 1000, "lanes": 4, "batch": 50, "horizon": 100, "evaluate_every": 2}
-    return handcoded.HandcodedConfig(task=task, **(defaults | options))
+    return handcoded_trpo.HandcodedConfig(task=task, **(defaults | options))
 
 
 @pytest.mark.parametrize("task", ["backflip", "hop"])
 def test_training_on_a_hand_coded_reward(task, tmp_path):
-    result = handcoded.train_handcoded(tiny(task), progress=False)
+    result = handcoded_trpo.train_handcoded(tiny(task), progress=False)
     assert [score.steps for score in result.curve] == [400, 800, 1000]
     assert result.best_score.reward_mean == max(score.reward_mean for score in result.curve)
     assert result.episode.qpos.shape == (101, 6)
-    handcoded.save_result(tmp_path / "flip.v1", result)
+    handcoded_trpo.save_result(tmp_path / "flip.v1", result)
     saved = load_hidden(tmp_path / "flip.v1.hidden.npz")
     np.testing.assert_array_equal(saved.qvel, result.episode.qvel)
     policy = Policy.from_dict(torch.load(tmp_path / "flip.v1.policy.pt", weights_only=True))
@@ -59,7 +59,7 @@ def test_training_on_a_hand_coded_reward(task, tmp_path):
 
 
 def test_same_seed_same_training():
-    a, b, c = (handcoded.train_handcoded(tiny(seed=s, steps=400), progress=False) for s in (1, 1, 2))
+    a, b, c = (handcoded_trpo.train_handcoded(tiny(seed=s, steps=400), progress=False) for s in (1, 1, 2))
     assert a.best_score.reward_mean == b.best_score.reward_mean
     assert a.best_score.reward_mean != c.best_score.reward_mean
 
@@ -70,8 +70,8 @@ def test_backflips_begin_within_16_thousand_steps():
     untrained = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=250, seed=0)
     still = evaluate(untrained.snapshot(), "hopper", nthread=0)
     before = task_reward("backflip", still.obs, still.actions, still.qpos, still.qvel).sum(1).mean()
-    config = handcoded.HandcodedConfig(steps=16_000, lanes=16, batch=250, horizon=250)
-    after = handcoded.train_handcoded(config, progress=False).curve[-1].reward_mean
+    config = handcoded_trpo.HandcodedConfig(steps=16_000, lanes=16, batch=250, horizon=250)
+    after = handcoded_trpo.train_handcoded(config, progress=False).curve[-1].reward_mean
     assert after > 2 * before
 
 
@@ -83,18 +83,18 @@ def test_command_line_says_what_is_wrong():
 
 
 def test_timetable():
-    plan = trajopt.FlipPlan(flips=2, period=2.0, start=0.5, roll=0.8)
+    plan = trajectory_search.FlipPlan(flips=2, period=2.0, start=0.5, roll=0.8)
     t = np.array([0.0, 0.4, 0.9, 1.4, 2.9, 4.5, 8.0])
-    angle, arc, since = trajopt.timetable(plan, t)
+    angle, arc, since = trajectory_search.timetable(plan, t)
     np.testing.assert_allclose(-angle / (2 * np.pi), [0, 0, 0.56, 1, 1.56, 2, 2], atol=0.02)
     np.testing.assert_allclose(since[:5], [-0.5, -0.1, 0.4, 0.9, 0.4])
     assert np.isnan(since[5:]).all(), "no third flip"
     # The apex of a ballistic arc of 0.8 s lies g t^2 / 8 = 0.785 m above the take-off.
-    assert arc[2] == pytest.approx(trajopt.TAKE_OFF + 9.81 * 0.8**2 / 8)
+    assert arc[2] == pytest.approx(trajectory_search.TAKE_OFF + 9.81 * 0.8**2 / 8)
     with pytest.raises(UserError, match="fit into its period"):
-        trajopt.FlipPlan(period=1.0)
+        trajectory_search.FlipPlan(period=1.0)
     with pytest.raises(UserError, match="elites"):
-        trajopt.FlipPlan(samples=4)
+        trajectory_search.FlipPlan(samples=4)
 
 
 def test_centre_of_mass_is_the_models():
@@ -102,7 +102,7 @@ def test_centre_of_mass_is_the_models():
     data = mujoco.MjData(env.model)
     data.qpos[:] = [0.3, 1.1, -2.0, -0.7, -1.1, 0.3]
     mujoco.mj_forward(env.model, data)
-    ours = trajopt.centre_of_mass(data.qpos)
+    ours = trajectory_search.centre_of_mass(data.qpos)
     np.testing.assert_allclose(ours, data.subtree_com[1][[0, 2]], atol=2e-3)
 
 
@@ -111,7 +111,10 @@ def test_short_optimisation_is_a_real_episode():
     short = {"flips": 1, "start": 0.1, "roll": 0.1, "period": 0.3, "seconds": 0.84}
     search = {"samples": 6, "elites": 2, "knots": 3, "iterations": 1, "take_off_iterations": 1}
     straight, turned = (
-        trajopt.optimise_flips(trajopt.FlipPlan(retries=n, **short, **search), progress=False) for n in (0, 2)
+        trajectory_search.optimise_flips(
+            trajectory_search.FlipPlan(retries=n, **short, **search), progress=False
+        )
+        for n in (0, 2)
     )
     assert straight.qpos.shape == turned.qpos.shape == (106, 6)
     assert (straight.actions != turned.actions).any(), "no flip in 0.1 s: it was tried again"
@@ -125,13 +128,13 @@ def test_short_optimisation_is_a_real_episode():
 
 def test_cost_of_the_ground():
     """One touch costs more than any pose; standing on the foot costs nothing of that kind."""
-    plan = trajopt.FlipPlan()
+    plan = trajectory_search.FlipPlan()
     stance = np.array([0, 1.22, 0, 0, 0, 0])
     kneeling = np.array([0, 0.46, 0.4, -0.6, -1.9, 0])
     poses = np.stack([stance, kneeling])
-    assert (clearances(poses)["leg"] < trajopt.SAFE).tolist() == [False, True]
+    assert (clearances(poses)["leg"] < trajectory_search.SAFE).tolist() == [False, True]
     assert clearances(poses)["foot"][0] < 0.011
-    stance_cost, kneeling_cost = trajopt.cost(plan, poses[:, None], 0 * poses[:, None], np.zeros(1))
+    stance_cost, kneeling_cost = trajectory_search.cost(plan, poses[:, None], 0 * poses[:, None], np.zeros(1))
     assert stance_cost < 5 < 30 < kneeling_cost
 
 

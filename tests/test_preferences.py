@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from onedemo.app.cli import main
-from onedemo.baselines import preferences, reward_model
-from onedemo.baselines.comparer import Comparer, ComparisonBudgetSpent, agreement
+from onedemo.baselines import preference_reward, preferences
+from onedemo.baselines.preference_reward import Comparison, RewardConfig, fit_reward, most_disputed
 from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, draw_pairs, train_preferences
-from onedemo.baselines.reward_model import Comparison, RewardConfig, fit_reward, most_disputed
+from onedemo.baselines.synthetic_comparer import Comparer, ComparisonBudgetSpent, agreement
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.errors import UserError
 from onedemo.records import Segment
@@ -138,7 +138,7 @@ def test_members_differ_and_the_most_disputed_pairs_are_taken(fitted):
 
 def test_noise_bounds_what_one_answer_can_cost():
     """0.9 p + 0.05: an answer against all evidence costs -ln 0.05 nats and not more."""
-    losses = reward_model._losses(torch.tensor([50.0, 50.0, 0.0]), torch.tensor([1.0, 0.0, 1.0]), 0.1)
+    losses = preference_reward._losses(torch.tensor([50.0, 50.0, 0.0]), torch.tensor([1.0, 0.0, 1.0]), 0.1)
     np.testing.assert_allclose(losses, [-math.log(0.95), -math.log(0.05), math.log(2)], rtol=1e-5)
 
 
@@ -218,7 +218,7 @@ def test_the_learner_sees_preferences_only(monkeypatch):
     turned = train_preferences(tiny(), progress=False)
     states = straight.final.state_dict(), turned.final.state_dict()
     assert not torch.equal(states[0]["mean.0.weight"], states[1]["mean.0.weight"])
-    for module in (preferences, reward_model):
+    for module in (preferences, preference_reward):
         assert "motion" not in Path(module.__file__).read_text(), "rewards are the comparer's alone"
 
 

@@ -23,8 +23,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from onedemo.baselines.comparer import Comparer, agreement
-from onedemo.baselines.reward_model import (
+from onedemo.baselines.preference_reward import (
     Comparison,
     Pair,
     RewardConfig,
@@ -34,6 +33,7 @@ from onedemo.baselines.reward_model import (
     most_disputed,
 )
 from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.baselines.synthetic_comparer import Comparer, agreement
 from onedemo.config import split_ratings
 from onedemo.core.cpu import cores
 from onedemo.demos.ground_truth import HiddenStates

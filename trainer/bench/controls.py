@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from onedemo.annotators.oracle import Oracle, appearance
-from onedemo.baselines.handcoded import HandcodedConfig, train_handcoded
+from onedemo.baselines.handcoded_trpo import HandcodedConfig, train_handcoded
 from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
 from onedemo.baselines.scores import Score
 from onedemo.bench.method import POINTS, Watch, hidden_of, oracle_of, outcome

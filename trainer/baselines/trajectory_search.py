@@ -1,6 +1,6 @@
 """Standing backflips with landings, by trajectory optimisation. It makes one of the demos.
 
-``python -m onedemo.baselines.trajopt --flips 3 --seed 0 --out PREFIX`` writes
+``python -m onedemo.baselines.trajectory_search --flips 3 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
 1999) searches the next second of motor commands for those that best keep a timetable of leaps, and
 the first part of the best plan is carried out. Touching the ground with anything but the foot

@@ -1,4 +1,4 @@
-"""Films the built-in demos anew: ``python -m onedemo.film hopper-hop --task hop --source "..."``.
+"""Films the built-in demos anew: ``python -m onedemo.baselines.make_demo hopper-hop --task hop --source "..."``.
 
 This is the maker of a simulated demo, so it may look at the states behind it; nothing that learns
 imports this module.
@@ -15,7 +15,7 @@ from onedemo.demos.library import BUILT_IN, render_demo, show
 
 def main(arguments: list[str] | None = None) -> None:
     """Reads ``<out>/<name>.hidden.npz``, writes the video and its description beside it."""
-    parser = argparse.ArgumentParser(prog="python -m onedemo.film", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m onedemo.baselines.make_demo", description=main.__doc__)
     parser.add_argument("name", help="the demo's name")
     parser.add_argument("--task", required=True, help="the hand-coded reward that describes it")
     parser.add_argument("--source", required=True, help="what made the motion")

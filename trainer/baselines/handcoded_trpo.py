@@ -1,6 +1,6 @@
 """The paper's first baseline: TRPO on a hand-coded reward. It also makes two of the demos.
 
-``python -m onedemo.baselines.handcoded --task backflip --steps 3000000 --seed 2 --out PREFIX``
+``python -m onedemo.baselines.handcoded_trpo --task backflip --steps 3000000 --seed 2 --out PREFIX``
 writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
 ``PREFIX.json`` (settings and the learning curve).
 """
