@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench.tables import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
 from onedemo.core.files import check_writable, write_atomic
 from onedemo.errors import UserError
+from onedemo.experiments.registry import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
 
 
 def add_commands(actions: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
@@ -74,18 +74,19 @@ def _speed(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace) -> int:
-    from onedemo.bench import document, study
+    from onedemo.bench import document
     from onedemo.bench.account import complete
+    from onedemo.experiments import runner
 
     _check_outputs(arguments)
     _check_directory("--results", arguments.results)
     table, quick = find_table(arguments.table), arguments.quick
     jobs = table.plan(arguments.seeds or default_seeds(table, quick=quick), quick=quick)
     if arguments.report_only:
-        outcomes = study.peek(jobs, arguments.results)
+        outcomes = runner.peek(jobs, arguments.results)
     else:
         try:
-            outcomes = study.run_jobs(jobs, arguments.results, workers=arguments.workers, tell=_tell)
+            outcomes = runner.run_jobs(jobs, arguments.results, workers=arguments.workers, tell=_tell)
         except KeyboardInterrupt:
             _tell(
                 f"stopped; finished runs are in {arguments.results}, and the same command goes on from them"

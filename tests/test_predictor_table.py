@@ -9,7 +9,9 @@ from onedemo.bench import document, predictor_table
 from onedemo.bench.blocks import Bars, Bullets, Chart, Table
 from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.bench.predictor_figures import PAPER, TEST, findings
-from onedemo.bench.predictor_scores import (
+from onedemo.bench.predictor_trial import VARIANTS, run
+from onedemo.config import load_config
+from onedemo.experiments.predictor_scores import (
     calibration_error,
     confusion,
     f1,
@@ -18,10 +20,8 @@ from onedemo.bench.predictor_scores import (
     reliability,
     spearman,
 )
-from onedemo.bench.predictor_trial import VARIANTS, run
-from onedemo.bench.study import Outcome, kind_of
-from onedemo.bench.worker import find_function
-from onedemo.config import load_config
+from onedemo.experiments.runner import Outcome, kind_of
+from onedemo.experiments.worker import find_function
 from onedemo.vision import pose_estimator
 
 # Scores

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from onedemo.app.cli import main
-from onedemo.bench import study, tables
-from onedemo.bench.seeds import band, spread_of
-from onedemo.bench.study import Job, Kind, peek, run_jobs
-from onedemo.bench.tables import Entry, parse_seeds
 from onedemo.errors import UserError
+from onedemo.experiments import registry, runner
+from onedemo.experiments.registry import Entry, parse_seeds
+from onedemo.experiments.runner import Job, Kind, peek, run_jobs
+from onedemo.experiments.statistics import band, spread_of
 
 
 def job(seed=0, kind="tiny:climb", label="climb", **settings):
@@ -56,7 +56,7 @@ def test_the_key_is_stable_and_does_not_know_the_label():
 
 def test_a_new_version_of_a_method_is_another_key(monkeypatch):
     before = Job(kind="method", label="x", settings={}, seed=0).key
-    monkeypatch.setitem(study.KINDS, "method", replace(study.KINDS["method"], version=99))
+    monkeypatch.setitem(runner.KINDS, "method", replace(runner.KINDS["method"], version=99))
     assert Job(kind="method", label="x", settings={}, seed=0).key != before
 
 
@@ -182,7 +182,7 @@ _PARENT = """
 import signal
 import sys
 from pathlib import Path
-from onedemo.bench.study import Job, run_jobs
+from onedemo.experiments.runner import Job, run_jobs
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 at, results = sys.argv[1:]
 jobs = [Job(kind="tiny:waits", label="wait", settings={"at": at}, seed=seed) for seed in (0, 1)]
@@ -250,13 +250,13 @@ def test_seeds_as_typed():
 
 @pytest.fixture
 def tiny_table(monkeypatch, tmp_path):
-    monkeypatch.setitem(tables.TABLES, "tiny", Entry("tiny", "a tiny table"))
+    monkeypatch.setitem(registry.TABLES, "tiny", Entry("tiny", "a tiny table"))
     monkeypatch.setattr(sys, "argv", ["onedemo", "bench", "tiny"])
     monkeypatch.chdir(tmp_path)
 
 
 def test_every_table_has_its_help(capsys):
-    for name in tables.TABLES:
+    for name in registry.TABLES:
         with pytest.raises(SystemExit):
             main(["bench", name, "--help"])
         assert "settings were tuned on seeds from 100 on" in " ".join(capsys.readouterr().out.split())
@@ -324,5 +324,5 @@ def test_tuning_seeds_are_told_apart(tiny_table, capsys):
 
 
 def test_kinds_name_functions():
-    for kind in study.KINDS.values():
+    for kind in runner.KINDS.values():
         assert isinstance(kind, Kind) and kind.function.count(":") == 1 and kind.version >= 1

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.bench.blocks import Chart, Document, Table, Text
-from onedemo.bench.seeds import band, spread
-from onedemo.bench.study import Job, by_label
+from onedemo.experiments.runner import Job, by_label
+from onedemo.experiments.statistics import band, spread
 
 TITLE = "onedemo: a tiny table"
 SEEDS = 3

@@ -12,10 +12,10 @@ from typing import Any
 from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
 from onedemo.bench.method import method_job
-from onedemo.bench.seeds import spread
-from onedemo.bench.study import Job, Outcome, by_label
 from onedemo.bench.summary import Groups, figure
 from onedemo.config import METHODS, RunConfig
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread
 
 TITLE = "onedemo: what each part contributes"
 SEEDS = 3

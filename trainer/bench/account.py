@@ -8,8 +8,8 @@ from typing import Any
 
 from onedemo.bench.blocks import Block, Document, Heading, Table, Text, number
 from onedemo.bench.document import about
-from onedemo.bench.study import Outcome, by_label, kind_of
-from onedemo.bench.tables import TUNING_FROM
+from onedemo.experiments.registry import TUNING_FROM
+from onedemo.experiments.runner import Outcome, by_label, kind_of
 
 _IN_ITS_FILE = ("curve", "errors", "episode")
 """What a result may hold that is too long for a report's figures."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Text
 from onedemo.bench.method import method_job, whole_config
-from onedemo.bench.study import Job, Outcome, by_label
 from onedemo.bench.summary import (
     Goal,
     Groups,
@@ -22,6 +21,7 @@ from onedemo.bench.summary import (
     moving_pictures,
     table,
 )
+from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: the backflip"
 SEEDS = 5

@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 
 from onedemo.annotators.oracle import Oracle
-from onedemo.bench.study import Job
 from onedemo.config import RunConfig, load_config, split_ratings, to_toml
 from onedemo.core.files import hold
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.evaluation.episodes import per_episode, perform, predicted_similarity, spread, state_errors
+from onedemo.experiments.runner import Job
 from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
 from onedemo.rl.rollouts import Episodes

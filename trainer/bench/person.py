@@ -13,10 +13,10 @@ from typing import Any
 
 from onedemo.bench import method
 from onedemo.bench.method import whole_config
-from onedemo.bench.study import Job
 from onedemo.core.files import hold
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
+from onedemo.experiments.runner import Job
 from onedemo.records import Demo
 
 VIDEO = "person_backflip_480.mp4"

@@ -13,7 +13,6 @@ from onedemo.bench.blocks import Block, Document, Heading, Picture, Text, number
 from onedemo.bench.movie import movie
 from onedemo.bench.person import person_demo, person_job, video
 from onedemo.bench.strip import strip
-from onedemo.bench.study import Job, Outcome, by_label
 from onedemo.bench.summary import (
     Goal,
     Groups,
@@ -26,6 +25,7 @@ from onedemo.bench.summary import (
     table,
 )
 from onedemo.errors import UserError
+from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: a real person's backflip"
 SEEDS = 5

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from onedemo.annotators.oracle import Oracle
-from onedemo.bench.predictor_scores import spearman
 from onedemo.demos.ground_truth import HiddenStates
+from onedemo.experiments.predictor_scores import spearman
 from onedemo.queries.selection import choose
 from onedemo.records import Rollouts, Segment
 from onedemo.reward.episode_rules import fill_bank

@@ -10,9 +10,9 @@ import numpy as np
 
 from onedemo.bench.blocks import number
 from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
-from onedemo.bench.predictor_scores import interval
-from onedemo.bench.seeds import Spread, spread
-from onedemo.bench.study import Outcome
+from onedemo.experiments.predictor_scores import interval
+from onedemo.experiments.runner import Outcome
+from onedemo.experiments.statistics import Spread, spread
 
 PAPER = {
     "random sampling": (54.22, 42.89, 13.46, 6.97),

@@ -42,10 +42,10 @@ from onedemo.bench.predictor_figures import (
     findings,
     rank,
 )
-from onedemo.bench.predictor_scores import BINS, interval
 from onedemo.bench.predictor_trial import VARIANTS
-from onedemo.bench.seeds import spread
-from onedemo.bench.study import Job, Outcome, by_label
+from onedemo.experiments.predictor_scores import BINS, interval
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread
 from onedemo.reward.model import CLASSES
 
 TITLE = "onedemo: how well ratings are predicted (Table 1)"

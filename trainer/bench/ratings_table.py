@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Block, Chart, Document, Line, Reference, Text
 from onedemo.bench.method import method_job
-from onedemo.bench.seeds import spread
-from onedemo.bench.study import Job, Outcome, by_label
 from onedemo.bench.summary import Groups, each_seed, figure, minutes, table
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread
 
 TITLE = "onedemo: how many ratings"
 SEEDS = 5

@@ -16,10 +16,10 @@ import numpy as np
 
 from onedemo.bench.blocks import Block, Cell, Chart, Line, Picture, Table, number
 from onedemo.bench.movie import movie
-from onedemo.bench.seeds import band, spread
-from onedemo.bench.study import Outcome
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.experiments.runner import Outcome
+from onedemo.experiments.statistics import band, spread
 
 Result = Mapping[str, Any]
 Groups = Mapping[str, Sequence[Outcome]]

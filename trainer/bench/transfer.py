@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from onedemo.bench import method
-from onedemo.bench.study import Job
 from onedemo.demos.library import find_demo
+from onedemo.experiments.runner import Job
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.store import Store
 from onedemo.training.simulated_run import train

@@ -11,9 +11,7 @@ import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
 from onedemo.bench.method import method_job
-from onedemo.bench.seeds import spread, spread_of
 from onedemo.bench.strip import strip
-from onedemo.bench.study import Job, Outcome, by_label
 from onedemo.bench.summary import (
     Groups,
     curves,
@@ -27,6 +25,8 @@ from onedemo.bench.summary import (
 from onedemo.bench.transfer import transfer_job
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread, spread_of
 
 TITLE = "onedemo: from one move to another"
 SEEDS = 5

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
     from onedemo.bench.document import Document
-    from onedemo.bench.study import Job, Outcome
+    from onedemo.experiments.runner import Job, Outcome
 
 TUNING_FROM = 100
 """Settings are tuned on seeds from here on, which no table reports; reports take 0, 1, 2 and so on."""

@@ -314,7 +314,7 @@ def _start(job: Job, results: Path) -> _Child | Outcome | None:
             **job.description,
         }
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "onedemo.bench.worker", json.dumps(request)],
+            [sys.executable, "-P", "-m", "onedemo.experiments.worker", json.dumps(request)],
             stdin=subprocess.PIPE,
             stdout=log,
             stderr=log,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from onedemo.bench.blocks import Line, number
-from onedemo.bench.study import Outcome
+from onedemo.experiments.runner import Outcome
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,6 +1,6 @@
-"""One job of a study in a process of its own: ``python -m onedemo.bench.worker REQUEST``.
+"""One job of a study in a process of its own: ``python -m onedemo.experiments.worker REQUEST``.
 
-REQUEST is JSON, as ``onedemo.bench.study`` makes it. The result is written to its file only when the
+REQUEST is JSON, as ``onedemo.experiments.runner`` makes it. The result is written to its file only when the
 job has finished; whatever else it writes goes into a scratch directory that is removed at the end.
 Standard input is a lifeline: when it ends, so does this process, for the study behind it has gone,
 however it went.

@@ -1,0 +1,1 @@
+"""Experiments over seeds: jobs, their runner, tables and reports; and speed."""
