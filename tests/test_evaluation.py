@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from onedemo.annotators.oracle import Oracle
-from onedemo.bench.controls import TrueRating
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.demos.library import BUILT_IN, find_demo
 from onedemo.evaluation.episodes import aligned_similarity, per_episode, spread, state_errors
 from onedemo.evaluation.time_warping import align
+from onedemo.experiments.jobs.controls import TrueRating
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 

@@ -7,10 +7,10 @@ import pytest
 
 from onedemo.bench import document, predictor_table
 from onedemo.bench.blocks import Bars, Bullets, Chart, Table
-from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.bench.predictor_figures import PAPER, TEST, findings
-from onedemo.bench.predictor_trial import VARIANTS, run
 from onedemo.config import load_config
+from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
+from onedemo.experiments.jobs.predictor_trial import VARIANTS, run
 from onedemo.experiments.predictor_scores import (
     calibration_error,
     confusion,

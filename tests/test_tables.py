@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from onedemo.bench import ablation_table, backflip_table, document, ratings_table
-from onedemo.bench.method import run_config
 from onedemo.bench.summary import Goal, figure, median_outcome, table
 from onedemo.config import METHODS, load_config
+from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.runner import Job, Outcome, by_label, run_jobs
 
 TABLES = (backflip_table, ratings_table, ablation_table)

@@ -6,13 +6,14 @@ import pytest
 from test_tables import run
 
 from onedemo.app.cli import main
-from onedemo.bench import document, person, person_table, transfer_table
-from onedemo.bench.method import run_config
+from onedemo.bench import document, person_table, transfer_table
 from onedemo.bench.strip import moments, strip
 from onedemo.bench.transfer_table import BACK, THERE
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.experiments.jobs import person
+from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.runner import Job, Outcome
 from onedemo.sim.task_rewards import farthest_turn, net_turns, turned
 

@@ -11,9 +11,9 @@ from typing import Any
 
 from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
-from onedemo.bench.method import method_job
 from onedemo.bench.summary import Groups, figure
 from onedemo.config import METHODS, RunConfig
+from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
 

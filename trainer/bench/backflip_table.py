@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Text
-from onedemo.bench.method import method_job, whole_config
 from onedemo.bench.summary import (
     Goal,
     Groups,
@@ -21,6 +20,7 @@ from onedemo.bench.summary import (
     moving_pictures,
     table,
 )
+from onedemo.experiments.jobs.method import method_job, whole_config
 from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: the backflip"

@@ -11,7 +11,6 @@ import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Picture, Text, number
 from onedemo.bench.movie import movie
-from onedemo.bench.person import person_demo, person_job, video
 from onedemo.bench.strip import strip
 from onedemo.bench.summary import (
     Goal,
@@ -25,6 +24,7 @@ from onedemo.bench.summary import (
     table,
 )
 from onedemo.errors import UserError
+from onedemo.experiments.jobs.person import person_demo, person_job, video
 from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: a real person's backflip"

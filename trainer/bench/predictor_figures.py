@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from onedemo.bench.blocks import number
-from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
+from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.experiments.predictor_scores import interval
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.statistics import Spread, spread

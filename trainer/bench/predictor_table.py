@@ -23,7 +23,6 @@ from onedemo.bench.blocks import (
     Table,
     Text,
 )
-from onedemo.bench.predictor_exam import ATTEMPTS, OTHERS
 from onedemo.bench.predictor_figures import (
     BESIDES,
     CONTRAST,
@@ -42,7 +41,8 @@ from onedemo.bench.predictor_figures import (
     findings,
     rank,
 )
-from onedemo.bench.predictor_trial import VARIANTS
+from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
+from onedemo.experiments.jobs.predictor_trial import VARIANTS
 from onedemo.experiments.predictor_scores import BINS, interval
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread

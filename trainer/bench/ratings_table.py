@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Block, Chart, Document, Line, Reference, Text
-from onedemo.bench.method import method_job
 from onedemo.bench.summary import Groups, each_seed, figure, minutes, table
+from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
 

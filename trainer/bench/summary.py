@@ -1,6 +1,6 @@
 """What tables of trainings have in common: figures out of results, goals, curves, moving pictures.
 
-Results are those of ``onedemo.bench.method`` and ``onedemo.bench.controls``.
+Results are those of ``onedemo.experiments.jobs.method`` and ``onedemo.experiments.jobs.controls``.
 """
 
 from __future__ import annotations

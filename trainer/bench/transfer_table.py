@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
-from onedemo.bench.method import method_job
 from onedemo.bench.strip import strip
 from onedemo.bench.summary import (
     Groups,
@@ -22,9 +21,10 @@ from onedemo.bench.summary import (
     moving_pictures,
     table,
 )
-from onedemo.bench.transfer import transfer_job
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.experiments.jobs.method import method_job
+from onedemo.experiments.jobs.transfer import transfer_job
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread, spread_of
 

@@ -43,13 +43,13 @@ class Kind:
 
 
 KINDS = {
-    "method": Kind("onedemo.bench.method:run"),
-    "transfer": Kind("onedemo.bench.transfer:run"),
-    "person": Kind("onedemo.bench.person:run"),
-    "predictor": Kind("onedemo.bench.predictor_trial:run", version=2),
-    "handcoded": Kind("onedemo.bench.controls:handcoded"),
-    "preferences": Kind("onedemo.bench.controls:preferences"),
-    "truth": Kind("onedemo.bench.controls:truth"),
+    "method": Kind("onedemo.experiments.jobs.method:run"),
+    "transfer": Kind("onedemo.experiments.jobs.transfer:run"),
+    "person": Kind("onedemo.experiments.jobs.person:run"),
+    "predictor": Kind("onedemo.experiments.jobs.predictor_trial:run", version=2),
+    "handcoded": Kind("onedemo.experiments.jobs.controls:handcoded"),
+    "preferences": Kind("onedemo.experiments.jobs.controls:preferences"),
+    "truth": Kind("onedemo.experiments.jobs.controls:truth"),
 }
 """By name; a new kind is one line here. "module:function" itself can stand for a kind, too."""
 

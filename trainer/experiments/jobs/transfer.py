@@ -1,6 +1,6 @@
 """The jobs behind Table 3: a predictor of one move, fine-tuned to another with few ratings.
 
-Settings of a job: ``source`` and ``target``, each the settings of ``onedemo.bench.method``, and
+Settings of a job: ``source`` and ``target``, each the settings of ``onedemo.experiments.jobs.method``, and
 ``demo``, the target's. The source run
 is trained first, for its ratings and its predictor alone; the target run starts from its newest snapshot.
 The result is that of the target run, with what the source cost.
@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench import method
 from onedemo.demos.library import find_demo
+from onedemo.experiments.jobs import method
 from onedemo.experiments.runner import Job
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.store import Store
@@ -43,10 +43,10 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         settings: See above.
         seed: Of both.
         scratch: Takes both.
-        cache: As for ``onedemo.bench.method.run``.
+        cache: As for ``onedemo.experiments.jobs.method.run``.
 
     Returns:
-        What ``onedemo.bench.method.run`` gives of the target run; ``source`` holds the ratings, control
+        What ``onedemo.experiments.jobs.method.run`` gives of the target run; ``source`` holds the ratings, control
         steps and seconds of the other.
     """
     cache = cache or scratch

@@ -1,6 +1,6 @@
 """What the method is compared with: rewards that somebody wrote, comparisons, and the true rating.
 
-Each gives the same kind of result as ``onedemo.bench.method``. Settings: ``demo``, which the episodes are
+Each gives the same kind of result as ``onedemo.experiments.jobs.method``. Settings: ``demo``, which the episodes are
 compared with, and ``steps`` of practice, and those named below.
 """
 
@@ -18,13 +18,13 @@ from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.baselines.handcoded_trpo import HandcodedConfig, train_handcoded
 from onedemo.baselines.preferences import PreferencesConfig, split_comparisons, train_preferences
 from onedemo.baselines.scores import Score
-from onedemo.bench.method import POINTS, Watch, hidden_of, oracle_of, outcome
 from onedemo.config import load_config
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation.episodes import per_episode, perform_policy
+from onedemo.experiments.jobs.method import POINTS, Watch, hidden_of, oracle_of, outcome
 from onedemo.records import Demo
 from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy
@@ -86,7 +86,7 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
 
     Args:
         settings: And ``method``: "paper" practises by a fixed clock from standing starts, "onedemo" with
-            an elastic clock, a bank of starts and giving up; and ``set``, as in ``onedemo.bench.method``.
+            an elastic clock, a bank of starts and giving up; and ``set``, as in ``onedemo.experiments.jobs.method``.
         seed: Of everything random.
         scratch: Not used.
 

@@ -1,6 +1,6 @@
 """The job behind the case study: a video of a real person, and a rater that goes by hand-made marks.
 
-Settings of a job are those of ``onedemo.bench.method`` without ``demo``; the rater "script", which errors
+Settings of a job are those of ``onedemo.experiments.jobs.method`` without ``demo``; the rater "script", which errors
 may follow, goes by the marks beside this file. The video is not part of this program.
 """
 
@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench import method
-from onedemo.bench.method import whole_config
 from onedemo.core.files import hold
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
+from onedemo.experiments.jobs import method
+from onedemo.experiments.jobs.method import whole_config
 from onedemo.experiments.runner import Job
 from onedemo.records import Demo
 
@@ -53,7 +53,7 @@ def person_job(
     label: str, seed: int, *, method: str = "onedemo", rater: str = "script", ratings: int = 350, steps: int,
     changes: Mapping[str, Any] | None = None,
 ) -> Job:  # fmt: skip
-    """A job of kind "person". Arguments as ``onedemo.bench.method.method_job``."""
+    """A job of kind "person". Arguments as ``onedemo.experiments.jobs.method.method_job``."""
     settings = {
         "method": method, "rater": rater, "ratings": ratings, "steps": steps, "set": dict(changes or {}),
     }  # fmt: skip
@@ -61,7 +61,7 @@ def person_job(
 
 
 def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:
-    """Trains on the person's video and evaluates: arguments and result as ``onedemo.bench.method.run``."""
+    """Trains on the person's video and evaluates: arguments and result as ``onedemo.experiments.jobs.method.run``."""
     cache = cache or scratch
     with hold(cache / "lock", wait=True):
         demo = person_demo(cache / "demos")

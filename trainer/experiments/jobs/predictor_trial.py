@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 from onedemo.annotators.oracle import Oracle
-from onedemo.bench.method import prepare
-from onedemo.bench.predictor_exam import Exam
 from onedemo.config import load_config
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
+from onedemo.experiments.jobs.method import prepare
+from onedemo.experiments.jobs.predictor_exam import Exam
 from onedemo.experiments.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
 from onedemo.records import Demo
 from onedemo.reward.model import CLASSES, Snapshot

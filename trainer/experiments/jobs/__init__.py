@@ -1,0 +1,1 @@
+"""What one process of an experiment does: settings and a seed in, figures out."""
