@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from onedemo.bench import document, predictor_table
+from onedemo.bench import document
 from onedemo.bench.blocks import Bars, Bullets, Chart, Table
-from onedemo.bench.predictor_figures import PAPER, TEST, findings
 from onedemo.config import load_config
 from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.experiments.jobs.predictor_trial import VARIANTS, run
@@ -21,6 +20,8 @@ from onedemo.experiments.predictor_scores import (
     spearman,
 )
 from onedemo.experiments.runner import Outcome, kind_of
+from onedemo.experiments.tables import predictor
+from onedemo.experiments.tables.predictor_figures import PAPER, TEST, findings
 from onedemo.experiments.worker import find_function
 from onedemo.vision import pose_estimator
 
@@ -94,7 +95,7 @@ def part(**changes):
 def outcomes(seeds, figures=lambda name, seed: {}, missing=()):
     """Made-up results of all jobs."""
     made = []
-    for job in predictor_table.plan(seeds, quick=False):
+    for job in predictor.plan(seeds, quick=False):
         result = {
             "classes": {
                 "fitted": [150, 40, 10, 0, 0], "validation": [70, 30, 0, 0, 0], "test": [75, 25, 0, 0, 0]
@@ -108,14 +109,14 @@ def outcomes(seeds, figures=lambda name, seed: {}, missing=()):
 
 
 def test_the_plan_fits_all_predictors_on_the_same_ratings():
-    jobs = predictor_table.plan((3, 4), quick=False)
+    jobs = predictor.plan((3, 4), quick=False)
     assert [(job.seed, job.settings["data"]) for job in jobs] == [
         (3, "paper"), (3, "onedemo"), (4, "paper"), (4, "onedemo")
     ]  # fmt: skip
     assert len({job.key for job in jobs}) == 4
     assert all(job.settings["split"] == [200, 100, 100] for job in jobs)
     assert find_function(kind_of(jobs[0]).function) is run
-    quick = predictor_table.plan((3,), quick=True)
+    quick = predictor.plan((3,), quick=True)
     assert not {job.key for job in quick} & {job.key for job in jobs}
 
 
@@ -158,7 +159,7 @@ def test_what_cannot_be_told_apart_is_said_loudly():
 
 def test_the_report_shows_every_seed_and_every_predictor():
     made = outcomes((0, 1, 2), lambda name, seed: {"test": 0.5 + seed / 10}, missing=(1,))
-    report = predictor_table.report(made, quick=False)
+    report = predictor.report(made, quick=False)
     tables = [block for block in report.blocks if isinstance(block, Table)]
     each = [table for table in tables if table.title == "Each seed, in the order 0, 1, 2"]
     assert each[0].rows[0][:2] == ["random sampling", "50, –, 70"]
@@ -180,7 +181,7 @@ def test_the_report_shows_every_seed_and_every_predictor():
 
 
 def test_the_report_of_nothing():
-    report = predictor_table.report(outcomes((0, 1), missing=(0, 1)), quick=True)
+    report = predictor.report(outcomes((0, 1), missing=(0, 1)), quick=True)
     assert next(block for block in report.blocks if isinstance(block, Bullets)).items == []
     assert "not run" not in document.as_text(report)
 
@@ -193,7 +194,7 @@ def test_a_quick_trial_of_both_kinds_of_ratings(tmp_path, monkeypatch):
     # A rougher idea of the robot's looks than the product has: learned from a tenth of the pictures.
     monkeypatch.setattr(pose_estimator, "PICTURES", 400)
     made = []
-    for job in predictor_table.plan((100,), quick=True):
+    for job in predictor.plan((100,), quick=True):
         result = document.plain(run(dict(job.settings), job.seed, tmp_path / "scratch", tmp_path / "cache"))
         made.append(Outcome(job=job, kept={"result": result}))
         for classes, count in zip(result["classes"].values(), (200, 100, 100), strict=True):
@@ -215,6 +216,6 @@ def test_a_quick_trial_of_both_kinds_of_ratings(tmp_path, monkeypatch):
     skewed, asked = (sum(o.result["classes"]["fitted"][2:]) for o in made)
     assert skewed + 10 < asked  # a random policy from standing hardly shows anything that deserves a 3
     assert not (tmp_path / "scratch").exists()  # what was learned of demo and robot is in the cache
-    report = predictor_table.report(made, quick=True)
+    report = predictor.report(made, quick=True)
     document.write(report, tmp_path / "report")
     assert (tmp_path / "report" / "reliability-random-policy.svg").exists()

@@ -4,13 +4,14 @@ import cv2
 import numpy as np
 import pytest
 
-from onedemo.bench import ablation_table, backflip_table, document, ratings_table
-from onedemo.bench.summary import Goal, figure, median_outcome, table
+from onedemo.bench import document
 from onedemo.config import METHODS, load_config
 from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.runner import Job, Outcome, by_label, run_jobs
+from onedemo.experiments.tables import ablation, backflip, ratings
+from onedemo.experiments.tables.summary import Goal, figure, median_outcome, table
 
-TABLES = (backflip_table, ratings_table, ablation_table)
+TABLES = (backflip, ratings, ablation)
 SEED = 101  # not one of those that are reported
 
 
@@ -30,14 +31,14 @@ def test_a_plan_has_different_jobs_of_settings_that_exist(table_module, quick):
 
 
 def test_nothing_gets_fewer_steps_than_onedemo():
-    jobs = backflip_table.plan((0,), quick=False)
+    jobs = backflip.plan((0,), quick=False)
     ours = next(job.settings["steps"] for job in jobs if job.label == "onedemo")
     assert min(job.settings["steps"] for job in jobs) == ours
 
 
 def test_tables_share_their_runs():
-    whole = {job.key for job in backflip_table.plan((0,), quick=False)}
-    shared = [job for job in ratings_table.plan((0,), quick=False) if job.key in whole]
+    whole = {job.key for job in backflip.plan((0,), quick=False)}
+    shared = [job for job in ratings.plan((0,), quick=False) if job.key in whole]
     assert [job.label for job in shared] == [
         "onedemo, 100 ratings",
         "onedemo, 350 ratings",
@@ -48,15 +49,15 @@ def test_tables_share_their_runs():
 def test_every_switch_between_the_methods_is_in_the_ablation():
     # A learned distance makes nothing of principal components, so onedemo has no row without them.
     of_network = "predictor.visual_dims"
-    for switches, left_out in ((ablation_table.SWITCHES, {of_network}), (ablation_table.ON, set())):
+    for switches, left_out in ((ablation.SWITCHES, {of_network}), (ablation.ON, set())):
         assert {key for keys in switches.values() for key in keys} == set(METHODS["paper"]) - left_out
-    everything = [key for keys in ablation_table.SWITCHES.values() for key in keys] + [of_network]
+    everything = [key for keys in ablation.SWITCHES.values() for key in keys] + [of_network]
     paper = load_config(None, {"method": "paper"})
-    assert load_config(None, {"method": "onedemo"} | ablation_table.off(everything)) == load_config(
+    assert load_config(None, {"method": "onedemo"} | ablation.off(everything)) == load_config(
         None, {"method": "onedemo"} | METHODS["paper"]
     )
-    assert run_config(_settings("paper", ablation_table.on(everything)), 0).practice != paper.practice
-    assert run_config(_settings("paper", ablation_table.on(everything)), 0).practice == load_config().practice
+    assert run_config(_settings("paper", ablation.on(everything)), 0).practice != paper.practice
+    assert run_config(_settings("paper", ablation.on(everything)), 0).practice == load_config().practice
 
 
 def _settings(method, changes):
@@ -97,7 +98,7 @@ def test_a_goal_counts_seeds(turns, of_5, count, asked, verdict):
 def test_the_hand_coded_goal_is_about_one_episode():
     """The turns of the episode with the best reward count, not those of another."""
     rewards = {"best": 16_000.0, "each": [16_000.0, 9_000.0]}
-    met = backflip_table.GOALS[0].met
+    met = backflip.GOALS[0].met
     assert met({"figures": {"backflip_reward": rewards, "net_turns": {"each": [2.0, 0.0]}}})
     assert not met({"figures": {"backflip_reward": rewards, "net_turns": {"each": [1.0, 9.0]}}})
 
@@ -135,7 +136,7 @@ def run(table_module, results, out):
 
 @pytest.mark.seam
 def test_backflip(results, tmp_path):
-    found, text = run(backflip_table, results, tmp_path)
+    found, text = run(backflip, results, tmp_path)
     ours, paper = found["onedemo"], found["paper"]
     for label, result in found.items():
         assert all(len(f["each"]) == 16 for f in result["figures"].values() if f), label
@@ -161,7 +162,7 @@ def test_backflip(results, tmp_path):
 
 @pytest.mark.seam
 def test_ratings(results, tmp_path):
-    found, text = run(ratings_table, results, tmp_path)
+    found, text = run(ratings, results, tmp_path)
     assert [result["ratings"] for result in found.values()] == [25, 60, 60]
     assert all(found[f"onedemo, {n} ratings"]["demo_rated"] > 3.5 for n in (25, 60))
     assert "Fewest ratings" in text
@@ -170,7 +171,7 @@ def test_ratings(results, tmp_path):
 
 @pytest.mark.seam
 def test_ablation(results, tmp_path):
-    found, text = run(ablation_table, results, tmp_path)
+    found, text = run(ablation, results, tmp_path)
     assert list(found) == [
         "onedemo", "paper", "onedemo without an elastic clock", "onedemo without giving up",
         "paper with an elastic clock",

@@ -6,15 +6,17 @@ import pytest
 from test_tables import run
 
 from onedemo.app.cli import main
-from onedemo.bench import document, person_table, transfer_table
+from onedemo.bench import document
 from onedemo.bench.strip import moments, strip
-from onedemo.bench.transfer_table import BACK, THERE
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.experiments.jobs import person
 from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.runner import Job, Outcome
+from onedemo.experiments.tables import person as person_table
+from onedemo.experiments.tables import transfer
+from onedemo.experiments.tables.transfer import BACK, THERE
 from onedemo.sim.task_rewards import farthest_turn, net_turns, turned
 
 SEED = 101  # not one of those that are reported
@@ -45,7 +47,7 @@ def test_rotation_is_counted_with_its_sign():
 
 @pytest.mark.parametrize("quick", [True, False])
 def test_fine_tuned_and_scratch_get_the_same_ratings_and_steps(quick):
-    jobs = {str(job): job for job in transfer_table.plan((0, 1), quick=quick)}
+    jobs = {str(job): job for job in transfer.plan((0, 1), quick=quick)}
     assert len({job.key for job in jobs.values()}) == len(jobs) == (4 if quick else 18)
     tuned = [job for job in jobs.values() if job.kind == "transfer"]
     for job in tuned:
@@ -76,21 +78,21 @@ def test_the_ratio_is_that_of_the_same_seeds():
         outcome(scratch, 1, hop_return=200.0), outcome(scratch, 0, hop_return=300.0),
     ]  # fmt: skip
     groups = {label: [o for o in found if o.job.label == label] for label in (tuned, scratch)}
-    rows = {row[:2]: row for row in transfer_table._goals(groups).rows}
+    rows = {row[:2]: row for row in transfer._goals(groups).rows}
     name = "backflip to hop, onedemo, hop_return"
     assert rows[name, "1.5 x scratch"][4:] == ("1.8", "1, 3", "**met**")
     assert rows[name, "beyond: 767"][-1] == "**met**"  # 900: best of 16, mean over seeds
     assert rows["backflip to hop, onedemo, hop_reward", "1.5 x scratch"][-1] == "missed"
     missing = Outcome(job=Job(kind="method", label=tuned, settings={}, seed=2), reason="not run")
     groups[tuned].append(missing)
-    assert transfer_table._goals(groups).rows[0][-1] == "open"
+    assert transfer._goals(groups).rows[0][-1] == "open"
     back = outcome(BACK.label("paper", True), 0)
-    assert transfer_table._goals({back.job.label: [back]}).rows == []  # nothing to compare it with
+    assert transfer._goals({back.job.label: [back]}).rows == []  # nothing to compare it with
 
 
 def test_the_papers_figures_stand_beside_ours():
-    planned = transfer_table.plan((0,), quick=False)
-    report = transfer_table.report([Outcome(job=job, reason="not run") for job in planned], quick=False)
+    planned = transfer.plan((0,), quick=False)
+    report = transfer.report([Outcome(job=job, reason="not run") for job in planned], quick=False)
     text = document.as_text(report)
     assert "767" in text and "1,007" in text and "433" in text and "not run" in text
 
@@ -121,7 +123,7 @@ def test_a_strip_shows_the_same_moments_of_both(tmp_path):
 
 @pytest.mark.seam
 def test_transfer(results, tmp_path):
-    found, text = run(transfer_table, results, tmp_path)
+    found, text = run(transfer, results, tmp_path)
     tuned, scratch = (found[THERE.label("onedemo", t)] for t in (True, False))
     assert tuned["ratings"] == scratch["ratings"] == 20 and tuned["source"]["ratings"] == 40
     assert tuned["curve"]["env_steps"] == scratch["curve"]["env_steps"]

@@ -51,12 +51,14 @@ class Entry:
 
 
 TABLES = {
-    "predictor": Entry("onedemo.bench.predictor_table", "how well ratings are predicted (Table 1)"),
-    "backflip": Entry("onedemo.bench.backflip_table", "what is learned, by which method (Table 2)"),
-    "transfer": Entry("onedemo.bench.transfer_table", "what a predictor of another move is worth (Table 3)"),
-    "ratings": Entry("onedemo.bench.ratings_table", "how much is learned from how many ratings"),
-    "person": Entry("onedemo.bench.person_table", "learning from a video of a real person"),
-    "ablation": Entry("onedemo.bench.ablation_table", "what each part of the method contributes"),
+    "predictor": Entry("onedemo.experiments.tables.predictor", "how well ratings are predicted (Table 1)"),
+    "backflip": Entry("onedemo.experiments.tables.backflip", "what is learned, by which method (Table 2)"),
+    "transfer": Entry(
+        "onedemo.experiments.tables.transfer", "what a predictor of another move is worth (Table 3)"
+    ),
+    "ratings": Entry("onedemo.experiments.tables.ratings", "how much is learned from how many ratings"),
+    "person": Entry("onedemo.experiments.tables.person", "learning from a video of a real person"),
+    "ablation": Entry("onedemo.experiments.tables.ablation", "what each part of the method contributes"),
 }
 """``onedemo bench NAME``; a new table is one module and one line here."""
 

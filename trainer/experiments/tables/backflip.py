@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Text
-from onedemo.bench.summary import (
+from onedemo.experiments.jobs.method import method_job, whole_config
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.tables.summary import (
     Goal,
     Groups,
     Result,
@@ -20,8 +22,6 @@ from onedemo.bench.summary import (
     moving_pictures,
     table,
 )
-from onedemo.experiments.jobs.method import method_job, whole_config
-from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: the backflip"
 SEEDS = 5

@@ -23,7 +23,12 @@ from onedemo.bench.blocks import (
     Table,
     Text,
 )
-from onedemo.bench.predictor_figures import (
+from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
+from onedemo.experiments.jobs.predictor_trial import VARIANTS
+from onedemo.experiments.predictor_scores import BINS, interval
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread
+from onedemo.experiments.tables.predictor_figures import (
     BESIDES,
     CONTRAST,
     COUNTED,
@@ -41,11 +46,6 @@ from onedemo.bench.predictor_figures import (
     findings,
     rank,
 )
-from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
-from onedemo.experiments.jobs.predictor_trial import VARIANTS
-from onedemo.experiments.predictor_scores import BINS, interval
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.statistics import spread
 from onedemo.reward.model import CLASSES
 
 TITLE = "onedemo: how well ratings are predicted (Table 1)"

@@ -11,7 +11,13 @@ import numpy as np
 
 from onedemo.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
 from onedemo.bench.strip import strip
-from onedemo.bench.summary import (
+from onedemo.demos.library import find_demo
+from onedemo.errors import UserError
+from onedemo.experiments.jobs.method import method_job
+from onedemo.experiments.jobs.transfer import transfer_job
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.statistics import spread, spread_of
+from onedemo.experiments.tables.summary import (
     Groups,
     curves,
     each_seed,
@@ -21,12 +27,6 @@ from onedemo.bench.summary import (
     moving_pictures,
     table,
 )
-from onedemo.demos.library import find_demo
-from onedemo.errors import UserError
-from onedemo.experiments.jobs.method import method_job
-from onedemo.experiments.jobs.transfer import transfer_job
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.statistics import spread, spread_of
 
 TITLE = "onedemo: from one move to another"
 SEEDS = 5

@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
-from onedemo.bench.summary import Groups, figure
 from onedemo.config import METHODS, RunConfig
 from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
+from onedemo.experiments.tables import backflip
+from onedemo.experiments.tables.summary import Groups, figure
 
 TITLE = "onedemo: what each part contributes"
 SEEDS = 3
 STEPS = 500_000
 """Control steps of practice: fewer than in the other tables, where learning is steepest."""
 RATINGS = 350
-QUICK_STEPS, QUICK_RATINGS = backflip_table.QUICK_STEPS, backflip_table.QUICK_RATINGS
+QUICK_STEPS, QUICK_RATINGS = backflip.QUICK_STEPS, backflip.QUICK_RATINGS
 
 SWITCHES: Mapping[str, tuple[str, ...]] = {
     "clips from random states": ("ratings.starts",),

@@ -12,7 +12,10 @@ import numpy as np
 from onedemo.bench.blocks import Block, Document, Heading, Picture, Text, number
 from onedemo.bench.movie import movie
 from onedemo.bench.strip import strip
-from onedemo.bench.summary import (
+from onedemo.errors import UserError
+from onedemo.experiments.jobs.person import person_demo, person_job, video
+from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.tables.summary import (
     Goal,
     Groups,
     curves,
@@ -23,9 +26,6 @@ from onedemo.bench.summary import (
     minutes,
     table,
 )
-from onedemo.errors import UserError
-from onedemo.experiments.jobs.person import person_demo, person_job, video
-from onedemo.experiments.runner import Job, Outcome, by_label
 
 TITLE = "onedemo: a real person's backflip"
 SEEDS = 5

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from onedemo.bench import backflip_table
 from onedemo.bench.blocks import Block, Chart, Document, Line, Reference, Text
-from onedemo.bench.summary import Groups, each_seed, figure, minutes, table
 from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
+from onedemo.experiments.tables import backflip
+from onedemo.experiments.tables.summary import Groups, each_seed, figure, minutes, table
 
 TITLE = "onedemo: how many ratings"
 SEEDS = 5
-STEPS = backflip_table.STEPS
+STEPS = backflip.STEPS
 """Control steps of practice: the runs with 100 and 350 ratings serve both tables."""
 RATINGS = (25, 50, 100, 200, 350, 700)
-QUICK_STEPS, QUICK_RATINGS = backflip_table.QUICK_STEPS, (25, backflip_table.QUICK_RATINGS)
+QUICK_STEPS, QUICK_RATINGS = backflip.QUICK_STEPS, (25, backflip.QUICK_RATINGS)
 METHODS = ("onedemo", "paper")
 
 _PAPER_RATINGS, _PAPER_TURNS, _PAPER_REWARD = 350, 2.0, 3365.0
