@@ -74,9 +74,9 @@ def _speed(arguments: argparse.Namespace) -> int:
 
 
 def _table(arguments: argparse.Namespace) -> int:
-    from onedemo.bench import document
-    from onedemo.bench.account import complete
     from onedemo.experiments import runner
+    from onedemo.experiments.report import document
+    from onedemo.experiments.report.account import complete
 
     _check_outputs(arguments)
     _check_directory("--results", arguments.results)

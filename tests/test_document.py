@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from onedemo.bench.blocks import (
+from onedemo.experiments.report.blocks import (
     Bars,
     Bullets,
     Chart,
@@ -20,7 +20,7 @@ from onedemo.bench.blocks import (
     number,
     numeric_columns,
 )
-from onedemo.bench.document import about, as_text, plain, write
+from onedemo.experiments.report.document import about, as_text, plain, write
 
 X = np.linspace(0, 3e6, 30)
 
@@ -124,7 +124,7 @@ def texts(svg):
 
 
 def test_charts_name_their_lines_axes_and_references():
-    drawing = pytest.importorskip("onedemo.bench.drawing")
+    drawing = pytest.importorskip("onedemo.experiments.report.drawing")
     found = texts(drawing.draw(chart()))
     assert {"Net turns", "environment steps", "turns", "ours", "theirs <&>", "the paper", "r", "1M"} <= {
         *found
@@ -149,7 +149,7 @@ def test_the_same_chart_is_the_same_file(tmp_path):
 
 
 def test_names_at_line_ends_do_not_touch():
-    drawing = pytest.importorskip("onedemo.bench.drawing")
+    drawing = pytest.importorskip("onedemo.experiments.report.drawing")
     places = drawing._apart(np.array([0.1, 0.5, 0.51, 0.52]), 0.1)
     assert np.diff(places).min() > 0.1 - 1e-9
     assert places[0] == pytest.approx(0.1) and np.mean(places[1:]) == pytest.approx(0.51)

@@ -5,8 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from onedemo.bench import document
-from onedemo.bench.blocks import Bars, Bullets, Chart, Table
 from onedemo.config import load_config
 from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.experiments.jobs.predictor_trial import VARIANTS, run
@@ -19,6 +17,8 @@ from onedemo.experiments.predictor_scores import (
     reliability,
     spearman,
 )
+from onedemo.experiments.report import document
+from onedemo.experiments.report.blocks import Bars, Bullets, Chart, Table
 from onedemo.experiments.runner import Outcome, kind_of
 from onedemo.experiments.tables import predictor
 from onedemo.experiments.tables.predictor_figures import PAPER, TEST, findings

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from onedemo.bench import document
 from onedemo.config import METHODS, load_config
 from onedemo.experiments.jobs.method import run_config
+from onedemo.experiments.report import document
 from onedemo.experiments.runner import Job, Outcome, by_label, run_jobs
 from onedemo.experiments.tables import ablation, backflip, ratings
 from onedemo.experiments.tables.summary import Goal, figure, median_outcome, table

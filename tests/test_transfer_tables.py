@@ -6,13 +6,13 @@ import pytest
 from test_tables import run
 
 from onedemo.app.cli import main
-from onedemo.bench import document
-from onedemo.bench.strip import moments, strip
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.experiments.jobs import person
 from onedemo.experiments.jobs.method import run_config
+from onedemo.experiments.report import document
+from onedemo.experiments.report.strip import moments, strip
 from onedemo.experiments.runner import Job, Outcome
 from onedemo.experiments.tables import person as person_table
 from onedemo.experiments.tables import transfer

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.bench.blocks import Chart, Document, Table, Text
+from onedemo.experiments.report.blocks import Chart, Document, Table, Text
 from onedemo.experiments.runner import Job, by_label
 from onedemo.experiments.statistics import band, spread
 

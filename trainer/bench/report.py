@@ -7,9 +7,19 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench.blocks import Block, Bullets, Chart, Document, Heading, Line, Table, Text, number
-from onedemo.bench.document import about, text_table, write
 from onedemo.bench.figures import Figure, Growth, Result, Skipped
+from onedemo.experiments.report.blocks import (
+    Block,
+    Bullets,
+    Chart,
+    Document,
+    Heading,
+    Line,
+    Table,
+    Text,
+    number,
+)
+from onedemo.experiments.report.document import about, text_table, write
 
 
 def as_json(results: Sequence[Result], *, command: str, seconds: float) -> dict[str, Any]:

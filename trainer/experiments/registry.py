@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
-    from onedemo.bench.document import Document
+    from onedemo.experiments.report.document import Document
     from onedemo.experiments.runner import Job, Outcome
 
 TUNING_FROM = 100

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import Line, number
+from onedemo.experiments.report.blocks import Line, number
 from onedemo.experiments.runner import Outcome
 
 

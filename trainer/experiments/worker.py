@@ -22,9 +22,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench.document import plain
-from onedemo.bench.machine import machine, now, program
 from onedemo.core.files import write_atomic
+from onedemo.experiments.report.document import plain
+from onedemo.experiments.report.machine import machine, now, program
 
 
 def main(request_json: str) -> None:

@@ -9,9 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from onedemo.bench.blocks import Bars, Block, Cell, Document, Heading, Reference, Table, Text, number
 from onedemo.config import METHODS, RunConfig
 from onedemo.experiments.jobs.method import method_job
+from onedemo.experiments.report.blocks import (
+    Bars,
+    Block,
+    Cell,
+    Document,
+    Heading,
+    Reference,
+    Table,
+    Text,
+    number,
+)
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
 from onedemo.experiments.tables import backflip

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from onedemo.bench.blocks import Block, Document, Heading, Text
 from onedemo.experiments.jobs.method import method_job, whole_config
+from onedemo.experiments.report.blocks import Block, Document, Heading, Text
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.tables.summary import (
     Goal,

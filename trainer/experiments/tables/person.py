@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import Block, Document, Heading, Picture, Text, number
-from onedemo.bench.movie import movie
-from onedemo.bench.strip import strip
 from onedemo.errors import UserError
 from onedemo.experiments.jobs.person import person_demo, person_job, video
+from onedemo.experiments.report.blocks import Block, Document, Heading, Picture, Text, number
+from onedemo.experiments.report.movie import movie
+from onedemo.experiments.report.strip import strip
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.tables.summary import (
     Goal,

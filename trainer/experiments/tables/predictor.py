@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import (
+from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
+from onedemo.experiments.jobs.predictor_trial import VARIANTS
+from onedemo.experiments.predictor_scores import BINS, interval
+from onedemo.experiments.report.blocks import (
     Bars,
     Block,
     Bullets,
@@ -23,9 +26,6 @@ from onedemo.bench.blocks import (
     Table,
     Text,
 )
-from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
-from onedemo.experiments.jobs.predictor_trial import VARIANTS
-from onedemo.experiments.predictor_scores import BINS, interval
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
 from onedemo.experiments.tables.predictor_figures import (

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import number
 from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
 from onedemo.experiments.predictor_scores import interval
+from onedemo.experiments.report.blocks import number
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.statistics import Spread, spread
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from onedemo.bench.blocks import Block, Chart, Document, Line, Reference, Text
 from onedemo.experiments.jobs.method import method_job
+from onedemo.experiments.report.blocks import Block, Chart, Document, Line, Reference, Text
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread
 from onedemo.experiments.tables import backflip

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import Block, Cell, Chart, Line, Picture, Table, number
-from onedemo.bench.movie import movie
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.experiments.report.blocks import Block, Cell, Chart, Line, Picture, Table, number
+from onedemo.experiments.report.movie import movie
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.statistics import band, spread
 

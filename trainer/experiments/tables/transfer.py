@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.blocks import Block, Document, Heading, Picture, Table, Text, number
-from onedemo.bench.strip import strip
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.jobs.transfer import transfer_job
+from onedemo.experiments.report.blocks import Block, Document, Heading, Picture, Table, Text, number
+from onedemo.experiments.report.strip import strip
 from onedemo.experiments.runner import Job, Outcome, by_label
 from onedemo.experiments.statistics import spread, spread_of
 from onedemo.experiments.tables.summary import (

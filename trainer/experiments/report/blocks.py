@@ -62,7 +62,7 @@ class Line:
     each: Sequence[Numbers] | Numbers = ()
     """Thin lines beside it, such as one for each seed; each as long as x."""
     colour: str = ""
-    """Of ``onedemo.bench.drawing.COLOURS``, or any other; by the order of lines if empty."""
+    """Of ``onedemo.experiments.report.drawing.COLOURS``, or any other; by the order of lines if empty."""
     dashed: bool = False
     marks: bool = False
     """A dot at each point."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from onedemo.bench.blocks import Block, Document, Heading, Table, Text, number
-from onedemo.bench.document import about
 from onedemo.experiments.registry import TUNING_FROM
+from onedemo.experiments.report.blocks import Block, Document, Heading, Table, Text, number
+from onedemo.experiments.report.document import about
 from onedemo.experiments.runner import Outcome, by_label, kind_of
 
 _IN_ITS_FILE = ("curve", "errors", "episode")

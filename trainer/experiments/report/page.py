@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import groupby
 
-from onedemo.bench.blocks import (
+from onedemo.experiments.report.blocks import (
     Block,
     Bullets,
     Cell,

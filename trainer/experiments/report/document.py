@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench.blocks import (
+from onedemo.core.files import write_atomic
+from onedemo.experiments.report.blocks import (
     Bars,
     Bullets,
     Cell,
@@ -25,9 +26,8 @@ from onedemo.bench.blocks import (
     numeric_columns,
     shown,
 )
-from onedemo.bench.machine import machine, now, program
-from onedemo.bench.page import as_html
-from onedemo.core.files import write_atomic
+from onedemo.experiments.report.machine import machine, now, program
+from onedemo.experiments.report.page import as_html
 
 
 def about(*, command: str, seconds: float | None = None, **more: Any) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def write(document: Document, out: Path) -> None:
         if isinstance(block, Picture):
             write_atomic(out / block.name, block.data)
         elif isinstance(block, Chart | Bars):
-            from onedemo.bench.drawing import draw
+            from onedemo.experiments.report.drawing import draw
 
             write_atomic(out / file_name(block), draw(block))
     write_atomic(out / "results.json", (json.dumps(record(document), indent=1) + "\n").encode())

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from onedemo.bench.blocks import Bars, Chart, Line, number
+from onedemo.experiments.report.blocks import Bars, Chart, Line, number
 
 COLOURS = ("#2f5dc4", "#d97a1d", "#0d8a72", "#9a4fb5", "#c23b55", "#5b7f1f", "#1f7fa8", "#8a6a3a")
 MUTED = "#8a94a3"

@@ -1,0 +1,1 @@
+"""Reports: blocks of text, tables and charts, as Markdown and JSON."""
