@@ -57,7 +57,8 @@ def _outputs(parser: argparse.ArgumentParser, *, quick: str) -> None:
 
 
 def _speed(arguments: argparse.Namespace) -> int:
-    from onedemo.bench import report, speed
+    from onedemo.experiments.speed import parts as speed
+    from onedemo.experiments.speed import report
 
     unknown = set(arguments.parts or ()) - set(speed.PARTS)
     if unknown:

@@ -22,9 +22,9 @@ from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from onedemo.bench.annotators import browser_session, open_tab, rating
-from onedemo.bench.painted import CHROMIUM_FLAGS, find_chromium
-from onedemo.bench.serving import Server, annotator_link
+from onedemo.experiments.speed.annotators import browser_session, open_tab, rating
+from onedemo.experiments.speed.painted import CHROMIUM_FLAGS, find_chromium
+from onedemo.experiments.speed.serving import Server, annotator_link
 from onedemo.storage.store import FILE_NAME, Store
 
 SETTINGS = [

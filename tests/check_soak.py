@@ -17,7 +17,7 @@ import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from onedemo.bench.serving import Server, bring, stocked
+from onedemo.experiments.speed.serving import Server, bring, stocked
 
 PEOPLE, EVERY_S = 5, 6.0
 _SAMPLES = 120

@@ -40,7 +40,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
-    from onedemo.bench.painted import CHROMIUM_FLAGS, find_chromium
+    from onedemo.experiments.speed.painted import CHROMIUM_FLAGS, find_chromium
 
     path = find_chromium()
     if path is None:

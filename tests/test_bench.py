@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from onedemo.app.cli import main
-from onedemo.bench import report, speed
-from onedemo.bench.figures import Figure, Growth, Skipped, by_turns, ratio, single
+from onedemo.experiments.speed import parts as speed
+from onedemo.experiments.speed import report
+from onedemo.experiments.speed.figures import Figure, Growth, Skipped, by_turns, ratio, single
 
 
 def made_up():
@@ -80,7 +81,7 @@ def test_report(tmp_path):
 
 
 def test_a_part_that_fails_does_not_lose_the_others(monkeypatch):
-    from onedemo.bench import fitting, physics
+    from onedemo.experiments.speed import fitting, physics
 
     def broken(quick):
         raise RuntimeError("no luck")
@@ -93,7 +94,7 @@ def test_a_part_that_fails_does_not_lose_the_others(monkeypatch):
 
 
 def test_a_failed_part_fails_the_command(monkeypatch, capsys):
-    from onedemo.bench import fitting
+    from onedemo.experiments.speed import fitting
 
     monkeypatch.setattr(fitting, "measure", lambda quick: 1 / 0)
     assert main(["bench", "speed", "--part", "fitting"]) == 1
@@ -131,8 +132,8 @@ def test_quick_run_of_physics_and_training(tmp_path, capsys):
 
 
 def test_made_up_ratings_are_skewed_like_those_of_a_random_policy():
-    from onedemo.bench.training import made_up_ratings
     from onedemo.config import load_config
+    from onedemo.experiments.speed.training import made_up_ratings
     from onedemo.training.learner import Learner
 
     learner = Learner(load_config(None, {"method": "paper"}), 240, 30.0)

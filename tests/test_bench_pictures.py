@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from onedemo.bench import pictures
-from onedemo.bench.figures import Figure
+from onedemo.experiments.speed import pictures
+from onedemo.experiments.speed.figures import Figure
 
 
 def test_poses_show_robots_flying_and_fallen():

@@ -10,9 +10,9 @@ from dataclasses import replace
 import aside
 import pytest
 
-from onedemo.bench import crowd, painted, product
-from onedemo.bench.annotators import Press, browser_session, open_tab
-from onedemo.bench.serving import Server, check_counts, give, stocked
+from onedemo.experiments.speed import crowd, painted, product
+from onedemo.experiments.speed.annotators import Press, browser_session, open_tab
+from onedemo.experiments.speed.serving import Server, check_counts, give, stocked
 
 pytestmark = pytest.mark.seam
 

@@ -26,11 +26,11 @@ from worlds import falling_demo, small_config
 from onedemo.app.cli import main
 from onedemo.app.links import read_secret
 from onedemo.backup import MANIFEST, back_up, restore
-from onedemo.bench.annotators import browser_session, open_tab, rating
-from onedemo.bench.serving import reach, serving
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
+from onedemo.experiments.speed.annotators import browser_session, open_tab, rating
+from onedemo.experiments.speed.serving import reach, serving
 from onedemo.render.clip_image import compose_clip
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store

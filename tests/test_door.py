@@ -22,9 +22,9 @@ from onedemo.app.limits import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Bu
 from onedemo.app.links import hash_token, passing_link, read_span
 from onedemo.app.listening import Listening
 from onedemo.app.messages import known
-from onedemo.bench.annotators import browser_session, open_tab
 from onedemo.core.names import check_name, check_person
 from onedemo.errors import UserError
+from onedemo.experiments.speed.annotators import browser_session, open_tab
 from onedemo.storage.store import Store
 
 ROOT = Path(__file__).parents[1]

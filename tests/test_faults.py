@@ -15,8 +15,8 @@ import pytest
 from test_loop import make_trainer, rate_all, wait_for
 from worlds import falling_demo, small_config
 
-from onedemo.bench.serving import serving
 from onedemo.errors import UserError, in_words
+from onedemo.experiments.speed.serving import serving
 from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam

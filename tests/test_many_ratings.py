@@ -8,7 +8,7 @@ import pytest
 from onedemo.app.data import data_html
 from onedemo.app.exports import csv_blocks
 from onedemo.app.quality import quality, quality_by_rater, rating_rows
-from onedemo.bench.data import _RUN, _ask_all, _begin, _fill, _press
+from onedemo.experiments.speed.data import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.storage.store import RATING_COLUMNS, Store
 
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from onedemo.bench.figures import Skipped
 from onedemo.config import load_config
 from onedemo.errors import UserError
+from onedemo.experiments.speed.figures import Skipped
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.rl.trpo import Trpo, TrpoConfig
@@ -226,7 +226,7 @@ def test_an_unknown_physics_is_refused():
 
 
 def test_the_bench_counts_steps_of_both():
-    from onedemo.bench.warp import growth, measure
+    from onedemo.experiments.speed.warp import growth, measure
 
     taken = growth((2, 8), device="cpu", turns=1, lane_steps=64)
     assert set(taken.y) == {"mujoco", "warp"}

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from onedemo.baselines.handcoded_trpo import HandcodedConfig, train_handcoded
-from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, single
 from onedemo.core.cpu import cores
+from onedemo.experiments.speed.figures import Figure, Growth, Result, Skipped, by_turns, single
 from onedemo.sim import vector_env
 from onedemo.sim.physics import Physics, RolloutPhysics, load_model
 

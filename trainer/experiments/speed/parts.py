@@ -7,8 +7,8 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
-from onedemo.bench.figures import Result, Skipped
-from onedemo.bench.physics import MISSING
+from onedemo.experiments.speed.figures import Result, Skipped
+from onedemo.experiments.speed.physics import MISSING
 
 PARTS = ("physics", "training", "sb3", "fitting", "pictures", "data", "product", "crowd", "painted", "warp")
 """Modules of ``onedemo.bench``; each has ``measure(quick) -> list[Result]``."""

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.bench.figures import Growth, Result, single
+from onedemo.experiments.speed.figures import Growth, Result, single
 from onedemo.records import Segment
 from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.segment_codec import pack_segment

@@ -22,7 +22,7 @@ from typing import IO
 
 from aiohttp import ClientSession
 
-from onedemo.bench.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
+from onedemo.experiments.speed.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
 from onedemo.storage.store import FILE_NAME, NewClip, Store
 
 _PATIENCE_S = 900.0

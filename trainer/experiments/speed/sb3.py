@@ -19,10 +19,10 @@ from stable_baselines3.common.vec_env import (  # pyright: ignore[reportMissingI
     VecEnv,
 )
 
-from onedemo.bench.figures import Result, by_turns, ratio
-from onedemo.bench.physics import stock_hopper
-from onedemo.bench.training import LANES, STEPS, one_thread
 from onedemo.core.cpu import cores
+from onedemo.experiments.speed.figures import Result, by_turns, ratio
+from onedemo.experiments.speed.physics import stock_hopper
+from onedemo.experiments.speed.training import LANES, STEPS, one_thread
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.rl.trpo import Trpo, TrpoConfig

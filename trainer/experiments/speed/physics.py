@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from onedemo.bench.figures import Growth, Result, Skipped, by_turns, ratio
 from onedemo.core.cpu import cores
+from onedemo.experiments.speed.figures import Growth, Result, Skipped, by_turns, ratio
 from onedemo.sim import physics_profiling, vector_env
 from onedemo.sim.physics import load_model
 

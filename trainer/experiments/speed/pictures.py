@@ -17,11 +17,11 @@ import gymnasium
 import numpy as np
 import torch
 
-from onedemo.bench.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
 from onedemo.config import PredictorConfig
 from onedemo.demos.library import find_demo, read_frames
 from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
+from onedemo.experiments.speed.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.model import visual_inputs

@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from onedemo.bench.figures import Figure, Growth, Result, Skipped
 from onedemo.experiments.report.blocks import (
     Block,
     Bullets,
@@ -20,6 +19,7 @@ from onedemo.experiments.report.blocks import (
     number,
 )
 from onedemo.experiments.report.document import about, text_table, write
+from onedemo.experiments.speed.figures import Figure, Growth, Result, Skipped
 
 
 def as_json(results: Sequence[Result], *, command: str, seconds: float) -> dict[str, Any]:

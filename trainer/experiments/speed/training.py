@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from onedemo.bench.figures import Result, by_turns, ratio, single
-from onedemo.bench.physics import Bare, full_states
 from onedemo.config import RunConfig, load_config
 from onedemo.core.cpu import cores
+from onedemo.experiments.speed.figures import Result, by_turns, ratio, single
+from onedemo.experiments.speed.physics import Bare, full_states
 from onedemo.records import Rollouts
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import RatedSegment

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.bench.figures import Result, Skipped, single
-from onedemo.bench.serving import Stocked, annotator_link, bring, stocked
+from onedemo.experiments.speed.figures import Result, Skipped, single
+from onedemo.experiments.speed.serving import Stocked, annotator_link, bring, stocked
 
 CHROMIUM_FLAGS = [
     "--use-gl=angle",

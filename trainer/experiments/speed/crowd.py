@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.bench.figures import Result, Skipped, single
-from onedemo.bench.serving import Stocked, bring, stocked
+from onedemo.experiments.speed.figures import Result, Skipped, single
+from onedemo.experiments.speed.serving import Stocked, bring, stocked
 
 PEOPLE = 50
 EVERY_S = 4.0

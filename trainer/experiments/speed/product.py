@@ -1,7 +1,7 @@
 """The product as people use it: how long a press, a rating and a start take, and how much memory it needs.
 
 The real command runs as a child process; one light process plays the people at its page
-(``onedemo.bench.annotators``) and reads the database beside it.
+(``onedemo.experiments.speed.annotators``) and reads the database beside it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.bench.annotators import Press, browser_session, open_tab
-from onedemo.bench.figures import Figure, Result, Skipped, ratio, single
-from onedemo.bench.serving import Server, Stocked, bring, check_counts, give, reach, serving, stocked
+from onedemo.experiments.speed.annotators import Press, browser_session, open_tab
+from onedemo.experiments.speed.figures import Figure, Result, Skipped, ratio, single
+from onedemo.experiments.speed.serving import (
+    Server,
+    Stocked,
+    bring,
+    check_counts,
+    give,
+    reach,
+    serving,
+    stocked,
+)
 
 CROWD = 50
 _EVERY_S = {1: 0.4, CROWD: 4.0}
