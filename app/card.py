@@ -5,8 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
-from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.words import ANSWERS
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version

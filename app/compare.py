@@ -10,7 +10,7 @@ from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from onedemo.app.pair_desk import PairDesk
+from onedemo.app.annotation.comparison_session import PairDesk
 from onedemo.app.pictures import version_of
 from onedemo.app.player import player_html
 from onedemo.app.pressing import Pressing

@@ -11,8 +11,8 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.charts import classes_html
-from onedemo.app.quality import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.words import ANSWERS, nobody_html
 from onedemo.records import Rater, Status
 from onedemo.storage.ratings import SKIP_COLUMNS

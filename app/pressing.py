@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from onedemo.app.desk import AnsweredElsewhere
+from onedemo.app.annotation.rating_session import AnsweredElsewhere
 
 log = logging.getLogger("onedemo.page")
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from onedemo.app import rate_html as html
-from onedemo.app.desk import Desk
+from onedemo.app.annotation.rating_session import Desk
 from onedemo.app.pictures import version_of
 from onedemo.app.pressing import Pressing
 from onedemo.app.words import ANSWERS, RATE_KEYS, keys_dialog

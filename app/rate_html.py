@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from html import escape
 
-from onedemo.app.desk import Desk
-from onedemo.app.lesson import Lesson
+from onedemo.app.annotation.rating_session import Desk
+from onedemo.app.annotation.tutorial import Lesson
 from onedemo.app.player import example_address, player_html
 from onedemo.app.words import ANSWERS, REASONS
 from onedemo.records import Demo, Status

@@ -7,7 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
-from onedemo.app.assignment import Again
+from onedemo.app.annotation.assignment import Again
 from onedemo.app.front import Front, check_port
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening

@@ -20,9 +20,9 @@ import viser
 from viser import _messages
 
 from onedemo.app import data, guide, rate, runs, watch
-from onedemo.app.assignment import Again, Ask, Assignment
+from onedemo.app.annotation.assignment import Again, Ask, Assignment
+from onedemo.app.annotation.rating_session import Desk, Mark
 from onedemo.app.compare import Compare
-from onedemo.app.desk import Desk, Mark
 from onedemo.app.live import Live
 from onedemo.app.pictures import Pictures
 from onedemo.app.proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER

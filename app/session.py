@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import viser
 
-from onedemo.app.assignment import Ask
-from onedemo.app.lesson import Lesson
+from onedemo.app.annotation.assignment import Ask
+from onedemo.app.annotation.tutorial import Lesson
 from onedemo.records import Rater, Status
 
 if TYPE_CHECKING:

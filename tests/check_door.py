@@ -35,7 +35,7 @@ import numpy as np
 import viser
 from standin import StandIn
 
-from onedemo.app.assignment import Again
+from onedemo.app.annotation.assignment import Again
 from onedemo.app.front import Front
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening

@@ -99,7 +99,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     )  # without a GPU each costs a tenth of a second
     from standin import StandIn
 
-    from onedemo.app.assignment import Again
+    from onedemo.app.annotation.assignment import Again
     from onedemo.app.front import Front
     from onedemo.app.links import issue_link, read_secret
     from onedemo.app.listening import Listening

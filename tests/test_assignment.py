@@ -8,8 +8,8 @@ import sqlite3
 import numpy as np
 import pytest
 
-from onedemo.app.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
-from onedemo.app.desk import AnsweredElsewhere, Desk
+from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
+from onedemo.app.annotation.rating_session import AnsweredElsewhere, Desk
 from onedemo.config import RatingsConfig, RunConfig
 from onedemo.records import Segment
 from onedemo.storage.ratings import Answered

@@ -5,9 +5,9 @@ import tracemalloc
 
 import pytest
 
+from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
 from onedemo.app.data import data_html
 from onedemo.app.exports import csv_blocks
-from onedemo.app.quality import quality, quality_by_rater, rating_rows
 from onedemo.experiments.speed.data import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.storage.store import RATING_COLUMNS, Store
 

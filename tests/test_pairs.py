@@ -9,11 +9,11 @@ import pytest
 from test_choice import rollouts
 from worlds import falling_demo, falling_states, small_config
 
-from onedemo.app.assignment import Assignment
+from onedemo.app.annotation.assignment import Assignment
+from onedemo.app.annotation.comparison_session import PairDesk
+from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.cli import main
 from onedemo.app.columns import COMPARISONS
-from onedemo.app.desk import AnsweredElsewhere
-from onedemo.app.pair_desk import PairDesk
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError

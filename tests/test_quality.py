@@ -4,7 +4,7 @@ import krippendorff
 import numpy as np
 import pytest
 
-from onedemo.app.quality import RatingRow, agreement, quality, quality_by_rater, warnings
+from onedemo.app.annotation.agreement import RatingRow, agreement, quality, quality_by_rater, warnings
 
 
 def row(clip, rater="Ann", value=3, *, repeat=False, latency_ms=2000, predicted=None):

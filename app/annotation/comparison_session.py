@@ -1,4 +1,4 @@
-"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``onedemo.app.desk``."""
+"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``onedemo.app.annotation.rating_session``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 
-from onedemo.app.assignment import Assignment, Seat
-from onedemo.app.desk import GUARD_SECONDS, AnsweredElsewhere
+from onedemo.app.annotation.assignment import Assignment, Seat
+from onedemo.app.annotation.rating_session import GUARD_SECONDS, AnsweredElsewhere
 from onedemo.records import Rater
 from onedemo.storage.store import Store
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 
-from onedemo.app.assignment import Ask, Assignment, Seat, to_repeat, to_share
+from onedemo.app.annotation.assignment import Ask, Assignment, Seat, to_repeat, to_share
 from onedemo.records import Rater
 from onedemo.reward.segment_marks import seconds_of_pictures
 from onedemo.storage.store import Store

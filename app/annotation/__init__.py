@@ -1,0 +1,1 @@
+"""The rules of rating and comparing, without any page: who gets which clip, and what a press does."""
