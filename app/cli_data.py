@@ -50,8 +50,8 @@ def check_output(file: Path, data_dir: Path) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from onedemo.app.card import card
-    from onedemo.app.exports import csv_blocks, write_parquet
+    from onedemo.app.dataset.card import card
+    from onedemo.app.dataset.ratings_csv import csv_blocks, write_parquet
     from onedemo.core.files import write_atomic
     from onedemo.storage.comparisons import COMPARISON_COLUMNS
     from onedemo.storage.ratings import SKIP_COLUMNS
@@ -82,7 +82,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    from onedemo.app.importing import import_data
+    from onedemo.app.dataset.importer import import_data
 
     there = import_data(arguments.ratings, arguments.segments, arguments.data_dir)
     print("  ".join(f"{count} {what}" for what, count in there.items()))

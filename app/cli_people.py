@@ -97,7 +97,7 @@ def _revoke(arguments: argparse.Namespace) -> None:
 
 
 def _audit(arguments: argparse.Namespace) -> None:
-    from onedemo.app.exports import csv_blocks
+    from onedemo.app.dataset.ratings_csv import csv_blocks
     from onedemo.core.files import write_atomic
     from onedemo.storage.audit_log import AUDIT_COLUMNS
 

@@ -13,9 +13,9 @@ from typing import Any
 
 from aiohttp import web
 
-from onedemo.app import exports
-from onedemo.app.card import card
-from onedemo.app.columns import RATINGS
+from onedemo.app.dataset import ratings_csv
+from onedemo.app.dataset.card import card
+from onedemo.app.dataset.columns import RATINGS
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.ratings import SKIP_COLUMNS
 from onedemo.storage.store import Store
@@ -41,17 +41,17 @@ class Downloads:
     async def csv(self, request: web.Request) -> web.StreamResponse:
         """The ratings."""
         rows = self._store.iter_ratings(**read_filters(request.query))
-        return await self._stream(request, "ratings", exports.csv_blocks(rows))
+        return await self._stream(request, "ratings", ratings_csv.csv_blocks(rows))
 
     async def comparisons(self, request: web.Request) -> web.StreamResponse:
         """The answers about pairs."""
         rows = self._store.iter_comparisons(read_filters(request.query).get("run"))
-        return await self._stream(request, "comparisons", exports.csv_blocks(rows, COMPARISON_COLUMNS))
+        return await self._stream(request, "comparisons", ratings_csv.csv_blocks(rows, COMPARISON_COLUMNS))
 
     async def skips(self, request: web.Request) -> web.StreamResponse:
         """Skipped clips, and why."""
         rows = self._store.iter_skips(read_filters(request.query).get("run"))
-        return await self._stream(request, "skips", exports.csv_blocks(rows, SKIP_COLUMNS))
+        return await self._stream(request, "skips", ratings_csv.csv_blocks(rows, SKIP_COLUMNS))
 
     async def _stream(
         self, request: web.Request, what: str, blocks: Generator[bytes, None, None]
@@ -74,7 +74,7 @@ class Downloads:
         run = read_filters(request.query).get("run")
         with tempfile.TemporaryDirectory() as directory:
             file = Path(directory) / "segments.parquet"
-            await asyncio.to_thread(exports.write_parquet, self._store, run, file)
+            await asyncio.to_thread(ratings_csv.write_parquet, self._store, run, file)
             response = self._attachment("segments", "parquet", "application/vnd.apache.parquet")
             await response.prepare(request)
             with file.open("rb") as source:
@@ -109,7 +109,7 @@ class Downloads:
         response.content_type = kind
         if kind.startswith("text/"):
             response.charset = "utf-8"
-        name = exports.file_name(what, suffix)
+        name = ratings_csv.file_name(what, suffix)
         response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
         return response
 

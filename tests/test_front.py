@@ -14,7 +14,7 @@ import pytest
 import viser
 from aside import run
 
-from onedemo.app import exports
+from onedemo.app.dataset import ratings_csv
 from onedemo.app.door import Door
 from onedemo.app.front import Front, check_port
 from onedemo.app.links import issue_link, read_secret
@@ -207,10 +207,10 @@ def test_export_is_for_researchers(site):
 
 def test_csv_cells_that_look_like_formulas_are_defused():
     for text in ("=1", "+1", "-1", "@x", "\tx", "\rx"):
-        assert exports.defuse(text) == "'" + text
-    assert exports.defuse(-1.5) == -1.5
-    assert exports.defuse("a=b") == "a=b"
-    blocks = list(exports.csv_blocks([(1,) * 14] * 5, rows_per_block=2))
+        assert ratings_csv.defuse(text) == "'" + text
+    assert ratings_csv.defuse(-1.5) == -1.5
+    assert ratings_csv.defuse("a=b") == "a=b"
+    blocks = list(ratings_csv.csv_blocks([(1,) * 14] * 5, rows_per_block=2))
     assert b"".join(blocks).count(b"\r\n") == 6
 
 

@@ -9,9 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from onedemo.app.card import card
 from onedemo.app.cli import main
-from onedemo.app.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
+from onedemo.app.dataset.card import card
+from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.config import load_config
 from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.store import RATING_COLUMNS, Store

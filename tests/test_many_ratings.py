@@ -7,7 +7,7 @@ import pytest
 
 from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
 from onedemo.app.data import data_html
-from onedemo.app.exports import csv_blocks
+from onedemo.app.dataset.ratings_csv import csv_blocks
 from onedemo.experiments.speed.data import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.storage.store import RATING_COLUMNS, Store
 

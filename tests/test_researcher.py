@@ -11,7 +11,7 @@ import pytest
 from test_page import DESKTOP, GUARD_MS, PHONE, opened, until
 
 from onedemo.app.cli import main
-from onedemo.app.columns import SKIPS
+from onedemo.app.dataset.columns import SKIPS
 from onedemo.storage.ratings import SKIP_COLUMNS
 
 pytestmark = pytest.mark.seam

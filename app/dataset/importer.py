@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from onedemo.app.columns import RATINGS
-from onedemo.app.parquet import read_about, read_segments
+from onedemo.app.dataset.columns import RATINGS
+from onedemo.app.dataset.parquet import read_about, read_segments
 from onedemo.core.files import write_atomic
 from onedemo.core.names import LONGEST, check_name
 from onedemo.errors import UserError
@@ -98,7 +98,7 @@ def _rows(file: Path) -> Iterator[dict[str, Any]]:
 
 
 def _armed(cell: str) -> str:
-    """A cell before it was made harmless to spreadsheets (``onedemo.app.exports.defuse``)."""
+    """A cell before it was made harmless to spreadsheets (``onedemo.app.dataset.ratings_csv.defuse``)."""
     return cell[1:] if cell.startswith("'") and cell[1:2] in ("=", "+", "-", "@", "\t", "\r") else cell
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from onedemo.app.columns import SEGMENTS
+from onedemo.app.dataset.columns import SEGMENTS
 from onedemo.errors import UserError
 from onedemo.records import ROLES, Clip, Segment
 

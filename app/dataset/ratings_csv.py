@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
-from onedemo.app.parquet import write_segments
+from onedemo.app.dataset.parquet import write_segments
 from onedemo.core.files import replacing
 from onedemo.storage.store import RATING_COLUMNS, Store
 
