@@ -11,10 +11,10 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from onedemo.app.annotation.comparison_session import PairDesk
-from onedemo.app.pictures import version_of
 from onedemo.app.player import player_html
 from onedemo.app.pressing import Pressing
 from onedemo.app.rate_html import tools_html
+from onedemo.app.services.demo_images import version_of
 from onedemo.app.words import COMPARE_KEYS, keys_dialog
 from onedemo.records import Status
 

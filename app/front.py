@@ -23,8 +23,8 @@ from onedemo.app.door import RATER, SECURITY_HEADERS, Door, Route
 from onedemo.app.downloads import Downloads
 from onedemo.app.files import Files, Filmed
 from onedemo.app.listening import Listening
-from onedemo.app.pictures import Pictures
 from onedemo.app.proxy import Proxy
+from onedemo.app.services.demo_images import Pictures
 from onedemo.app.uploads import Uploads
 from onedemo.errors import UserError
 from onedemo.records import Status

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from onedemo.app import rate_html as html
 from onedemo.app.annotation.rating_session import Desk
-from onedemo.app.pictures import version_of
 from onedemo.app.pressing import Pressing
+from onedemo.app.services.demo_images import version_of
 from onedemo.app.words import ANSWERS, RATE_KEYS, keys_dialog
 from onedemo.records import Status
 

@@ -12,7 +12,7 @@ from onedemo.app.front import Front, check_port
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
 from onedemo.app.server import Page
-from onedemo.app.study import Study
+from onedemo.app.services.run_manager import Study
 from onedemo.config import RunConfig
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread

@@ -13,8 +13,8 @@ import mujoco
 from mjviser import ViserMujocoScene
 
 from onedemo.app import charts, progress
-from onedemo.app.live import Moment
-from onedemo.app.pictures import version_of
+from onedemo.app.services.demo_images import version_of
+from onedemo.app.services.live_rollout import Moment
 from onedemo.app.words import nobody_html
 from onedemo.records import HALTED, Status
 

@@ -39,8 +39,8 @@ from onedemo.app.annotation.assignment import Again
 from onedemo.app.front import Front
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
-from onedemo.app.pictures import Pictures
 from onedemo.app.server import Page
+from onedemo.app.services.demo_images import Pictures
 from onedemo.demos.library import import_video
 from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.demos.video import write_webm

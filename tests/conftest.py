@@ -95,7 +95,7 @@ class Site:
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     monkeypatch.setattr(
-        "onedemo.app.live.FRAMES_PER_SECOND", 5.0
+        "onedemo.app.services.live_rollout.FRAMES_PER_SECOND", 5.0
     )  # without a GPU each costs a tenth of a second
     from standin import StandIn
 
@@ -103,8 +103,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     from onedemo.app.front import Front
     from onedemo.app.links import issue_link, read_secret
     from onedemo.app.listening import Listening
-    from onedemo.app.pictures import Pictures
     from onedemo.app.server import Page
+    from onedemo.app.services.demo_images import Pictures
 
     trainer = StandIn(tmp_path)
     page = Page(

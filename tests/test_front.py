@@ -19,7 +19,7 @@ from onedemo.app.door import Door
 from onedemo.app.front import Front, check_port
 from onedemo.app.links import issue_link, read_secret
 from onedemo.app.listening import Listening
-from onedemo.app.pictures import version_of
+from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
 from onedemo.storage.store import RATING_COLUMNS, Store
 

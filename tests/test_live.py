@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from standin import Wobble
 
-from onedemo.app.live import Live
+from onedemo.app.services.live_rollout import Live
 from onedemo.rl.rollouts import Acting, EpisodeRules
 
 

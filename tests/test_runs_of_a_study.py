@@ -5,9 +5,9 @@ from contextlib import closing
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from onedemo.app import study as module
 from onedemo.app.actions import Actions
-from onedemo.app.study import Study
+from onedemo.app.services import run_manager as module
+from onedemo.app.services.run_manager import Study
 from onedemo.core.files import hold
 from onedemo.errors import UserError
 from onedemo.records import Rater

@@ -10,7 +10,7 @@ class Exercise:
     """One practice clip."""
 
     example: str
-    """Which of the examples (``app/pictures.py``)."""
+    """Which of the examples (``app/services/demo_images.py``)."""
     right: tuple[int, ...]
     """What people would give."""
     why: str

@@ -1,0 +1,1 @@
+"""What all pages share: the runs, the live rollout, pictures of the demo."""
