@@ -212,7 +212,7 @@ def _config(arguments: argparse.Namespace) -> Any:
 
 def _serve(arguments: argparse.Namespace) -> None:
     from onedemo.app.annotation.assignment import Again
-    from onedemo.app.listening import Listening
+    from onedemo.app.http.bind import Listening
     from onedemo.app.serve import serve
     from onedemo.demos.library import find_demo
 

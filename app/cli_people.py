@@ -43,7 +43,7 @@ def add_people_commands(commands: Any, command: Callable[..., argparse.ArgumentP
 
 
 def _add(arguments: argparse.Namespace) -> None:
-    from onedemo.app.links import issue_link, passing_link, read_secret, read_span
+    from onedemo.app.http.tokens import issue_link, passing_link, read_secret, read_span
     from onedemo.core.names import check_person
 
     name = check_person(arguments.name)

@@ -8,7 +8,7 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from onedemo.app import charts
-from onedemo.app.uploads import form_html
+from onedemo.app.http.uploads import form_html
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
 from onedemo.records import HALTED, Status

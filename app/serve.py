@@ -8,9 +8,9 @@ import threading
 from pathlib import Path
 
 from onedemo.app.annotation.assignment import Again
-from onedemo.app.front import Front, check_port
-from onedemo.app.links import issue_link, read_secret
-from onedemo.app.listening import Listening
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.server import Front, check_port
+from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.server import Page
 from onedemo.app.services.run_manager import Study
 from onedemo.config import RunConfig

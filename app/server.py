@@ -23,7 +23,7 @@ from onedemo.app import data, guide, rate, runs, watch
 from onedemo.app.annotation.assignment import Again, Ask, Assignment
 from onedemo.app.annotation.rating_session import Desk, Mark
 from onedemo.app.compare import Compare
-from onedemo.app.proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
+from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from onedemo.app.services.demo_images import Pictures
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study

@@ -36,9 +36,9 @@ import viser
 from standin import StandIn
 
 from onedemo.app.annotation.assignment import Again
-from onedemo.app.front import Front
-from onedemo.app.links import issue_link, read_secret
-from onedemo.app.listening import Listening
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.server import Front
+from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.server import Page
 from onedemo.app.services.demo_images import Pictures
 from onedemo.demos.library import import_video

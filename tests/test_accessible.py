@@ -30,7 +30,7 @@ def assert_nothing_serious(page, where: str) -> None:
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
-    from onedemo.app.links import issue_link, read_secret
+    from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
     new = store.ensure_rater("new", "annotator")

@@ -24,7 +24,7 @@ from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
 
 from onedemo.app.cli import main
-from onedemo.app.links import read_secret
+from onedemo.app.http.tokens import read_secret
 from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video

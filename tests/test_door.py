@@ -18,10 +18,10 @@ import pytest
 from aside import run
 
 from onedemo.app.cli import main
-from onedemo.app.limits import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Buckets, Places
-from onedemo.app.links import hash_token, passing_link, read_span
-from onedemo.app.listening import Listening
-from onedemo.app.messages import known
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.rate_limit import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Buckets, Places
+from onedemo.app.http.tokens import hash_token, passing_link, read_span
+from onedemo.app.http.viser_protocol import known
 from onedemo.core.names import check_name, check_person
 from onedemo.errors import UserError
 from onedemo.experiments.speed.annotators import browser_session, open_tab
@@ -85,7 +85,7 @@ def test_a_strangers_name_for_this_machine_gets_nothing(site):
 
 @pytest.mark.seam
 def test_the_page_can_be_served_encrypted(site, tmp_path):
-    from onedemo.app.front import Front
+    from onedemo.app.http.server import Front
 
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost",
@@ -110,7 +110,7 @@ def test_the_page_can_be_served_encrypted(site, tmp_path):
 
 @pytest.mark.seam
 def test_a_proxy_is_believed_only_where_there_is_one(site):
-    from onedemo.app.front import Front
+    from onedemo.app.http.server import Front
 
     asked = {"X-Forwarded-For": "6.6.6.6, 10.0.0.9", "X-Forwarded-Proto": "https"}
     link = site.links["annotator"].removeprefix(site.url)

@@ -15,10 +15,10 @@ import viser
 from aside import run
 
 from onedemo.app.dataset import ratings_csv
-from onedemo.app.door import Door
-from onedemo.app.front import Front, check_port
-from onedemo.app.links import issue_link, read_secret
-from onedemo.app.listening import Listening
+from onedemo.app.http.auth import Door
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.server import Front, check_port
+from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
 from onedemo.storage.store import RATING_COLUMNS, Store

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from onedemo.app.links import hash_token, issue_link, link_token, new_session_token, read_secret
+from onedemo.app.http.tokens import hash_token, issue_link, link_token, new_session_token, read_secret
 from onedemo.errors import UserError
 from onedemo.records import Rater
 from onedemo.storage.store import Store

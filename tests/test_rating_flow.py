@@ -23,7 +23,7 @@ def marks_of(site) -> list[tuple]:
 
 @BOTH
 def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromium, site, viewport):
-    from onedemo.app.links import issue_link, read_secret
+    from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
     new = store.ensure_rater("new", "annotator")

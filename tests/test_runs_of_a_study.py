@@ -5,7 +5,7 @@ from contextlib import closing
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from onedemo.app.actions import Actions
+from onedemo.app.http.commands import Actions
 from onedemo.app.services import run_manager as module
 from onedemo.app.services.run_manager import Study
 from onedemo.core.files import hold

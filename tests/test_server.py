@@ -8,7 +8,8 @@ import viser
 from aside import run
 from viser import _messages
 
-from onedemo.app import assets, server
+from onedemo.app import server
+from onedemo.app.http import assets
 
 pytestmark = pytest.mark.seam
 

@@ -9,11 +9,11 @@ from aiohttp import web
 from aside import run
 from test_demos import make_video
 
-from onedemo.app import uploads
-from onedemo.app.door import Door, Route
-from onedemo.app.links import issue_link, read_secret
-from onedemo.app.listening import Listening
-from onedemo.app.uploads import Uploads
+from onedemo.app.http import uploads
+from onedemo.app.http.auth import Door, Route
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.tokens import issue_link, read_secret
+from onedemo.app.http.uploads import Uploads
 from onedemo.demos.library import find_demo, read_frames
 from onedemo.storage.store import Store
 

@@ -11,8 +11,8 @@ from typing import Protocol
 
 from aiohttp import ClientSession, ClientWebSocketResponse, WSCloseCode, WSMsgType, web
 
-from onedemo.app.door import RATER, SESSION, same_origin
-from onedemo.app.limits import (
+from onedemo.app.http.auth import RATER, SESSION, same_origin
+from onedemo.app.http.rate_limit import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
     LARGEST_MESSAGE,
@@ -23,7 +23,7 @@ from onedemo.app.limits import (
     Bucket,
     Places,
 )
-from onedemo.app.messages import known
+from onedemo.app.http.viser_protocol import known
 from onedemo.storage.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from aiohttp import web
 
-from onedemo.app import assets
+from onedemo.app.http import assets
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.storage.store import Store

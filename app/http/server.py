@@ -1,6 +1,6 @@
 """The public HTTP port: one table of what there is and who may have it.
 
-``onedemo.app.door`` says who asks, ``onedemo.app.files`` and ``onedemo.app.downloads`` hand out files, ``onedemo.app.proxy`` carries
+``onedemo.app.http.auth`` says who asks, ``onedemo.app.http.media`` and ``onedemo.app.http.exports`` hand out files, ``onedemo.app.http.viser_proxy`` carries
 the page's WebSocket to Viser. The page itself is Viser's single HTML file with our style sheet and
 key handling added.
 """
@@ -17,15 +17,15 @@ from typing import Any, Protocol
 
 from aiohttp import web
 
-from onedemo.app import assets
-from onedemo.app.actions import Actions
-from onedemo.app.door import RATER, SECURITY_HEADERS, Door, Route
-from onedemo.app.downloads import Downloads
-from onedemo.app.files import Files, Filmed
-from onedemo.app.listening import Listening
-from onedemo.app.proxy import Proxy
+from onedemo.app.http import assets
+from onedemo.app.http.auth import RATER, SECURITY_HEADERS, Door, Route
+from onedemo.app.http.bind import Listening
+from onedemo.app.http.commands import Actions
+from onedemo.app.http.exports import Downloads
+from onedemo.app.http.media import Files, Filmed
+from onedemo.app.http.uploads import Uploads
+from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.services.demo_images import Pictures
-from onedemo.app.uploads import Uploads
 from onedemo.errors import UserError
 from onedemo.records import Status
 
