@@ -11,8 +11,8 @@ from onedemo.app.annotation.assignment import Again
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front, check_port
 from onedemo.app.http.tokens import issue_link, read_secret
-from onedemo.app.server import Page
 from onedemo.app.services.run_manager import Study
+from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
 from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread

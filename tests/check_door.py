@@ -39,8 +39,8 @@ from onedemo.app.annotation.assignment import Again
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
-from onedemo.app.server import Page
 from onedemo.app.services.demo_images import Pictures
+from onedemo.app.ui.app import Page
 from onedemo.demos.library import import_video
 from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.demos.video import write_webm

@@ -103,8 +103,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     from onedemo.app.http.bind import Listening
     from onedemo.app.http.server import Front
     from onedemo.app.http.tokens import issue_link, read_secret
-    from onedemo.app.server import Page
     from onedemo.app.services.demo_images import Pictures
+    from onedemo.app.ui.app import Page
 
     trainer = StandIn(tmp_path)
     page = Page(

@@ -7,7 +7,7 @@ import pytest
 from test_choice import rollouts as empty_rollouts
 from worlds import falling_demo, falling_states
 
-from onedemo.app.progress import chosen, gallery_html, timeline_html
+from onedemo.app.ui.progress import chosen, gallery_html, timeline_html
 from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery

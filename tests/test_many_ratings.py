@@ -6,8 +6,8 @@ import tracemalloc
 import pytest
 
 from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
-from onedemo.app.data import data_html
 from onedemo.app.dataset.ratings_csv import csv_blocks
+from onedemo.app.ui.data_tab import data_html
 from onedemo.experiments.speed.data import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.storage.store import RATING_COLUMNS, Store
 

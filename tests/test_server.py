@@ -8,8 +8,8 @@ import viser
 from aside import run
 from viser import _messages
 
-from onedemo.app import server
 from onedemo.app.http import assets
+from onedemo.app.ui import app
 
 pytestmark = pytest.mark.seam
 
@@ -67,12 +67,12 @@ def camera_message() -> bytes:
 
 
 def test_roles_get_their_tabs():
-    assert [tab.title for tab in server.tabs_of("annotator")] == ["Rate", "Guide"]
-    assert [tab.title for tab in server.tabs_of("annotator", compare=True)] == ["Rate", "Compare", "Guide"]
-    titles = [tab.title for tab in server.tabs_of("researcher")]
+    assert [tab.title for tab in app.tabs_of("annotator")] == ["Rate", "Guide"]
+    assert [tab.title for tab in app.tabs_of("annotator", compare=True)] == ["Rate", "Compare", "Guide"]
+    titles = [tab.title for tab in app.tabs_of("researcher")]
     assert titles == ["Watch", "Runs", "Rate", "Compare", "Data", "Guide"]
 
 
 def test_only_known_messages_are_let_in():
-    assert _messages.ShareUrlRequest not in server._MESSAGES_LET_IN
-    assert _messages.FileTransferStartUpload not in server._MESSAGES_LET_IN
+    assert _messages.ShareUrlRequest not in app._MESSAGES_LET_IN
+    assert _messages.FileTransferStartUpload not in app._MESSAGES_LET_IN

@@ -7,7 +7,7 @@ from typing import Any
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
-from onedemo.app.words import ANSWERS
+from onedemo.app.ui.strings import ANSWERS
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
 

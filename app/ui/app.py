@@ -19,15 +19,15 @@ import rich
 import viser
 from viser import _messages
 
-from onedemo.app import data, guide, rate, runs, watch
 from onedemo.app.annotation.assignment import Again, Ask, Assignment
 from onedemo.app.annotation.rating_session import Desk, Mark
-from onedemo.app.compare import Compare
 from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
 from onedemo.app.services.demo_images import Pictures
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study
-from onedemo.app.session import Session, TabMaker
+from onedemo.app.ui import data_tab, guide_tab, rate_tab, runs_tab, watch_tab
+from onedemo.app.ui.compare_tab import Compare
+from onedemo.app.ui.session import Session, TabMaker
 from onedemo.records import Rater
 
 log = logging.getLogger("onedemo.page")
@@ -180,8 +180,8 @@ class Page:
 def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
     """The tabs a role gets, in order; the first one is shown first."""
     if role == "researcher":
-        return [watch.Watch, runs.Runs, rate.Rate, Compare, data.Data, guide.Guide]
-    return [rate.Rate, *([Compare] if compare else []), guide.Guide]
+        return [watch_tab.Watch, runs_tab.Runs, rate_tab.Rate, Compare, data_tab.Data, guide_tab.Guide]
+    return [rate_tab.Rate, *([Compare] if compare else []), guide_tab.Guide]
 
 
 # Viser's private names, all of them; tests/test_server.py holds them.

@@ -9,15 +9,15 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from onedemo.app import rate_html as html
 from onedemo.app.annotation.rating_session import Desk
-from onedemo.app.pressing import Pressing
 from onedemo.app.services.demo_images import version_of
-from onedemo.app.words import ANSWERS, RATE_KEYS, keys_dialog
+from onedemo.app.ui import rate_html as html
+from onedemo.app.ui.strings import ANSWERS, RATE_KEYS, keys_dialog
+from onedemo.app.ui.tab import Pressing
 from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 _MIDDLE = 3
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
-from onedemo.app.charts import classes_html
-from onedemo.app.words import ANSWERS, nobody_html
+from onedemo.app.ui.charts import classes_html
+from onedemo.app.ui.strings import ANSWERS, nobody_html
 from onedemo.records import Rater, Status
 from onedemo.storage.ratings import SKIP_COLUMNS
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 log = logging.getLogger("onedemo.page")
 

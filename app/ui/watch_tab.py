@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 from mjviser import ViserMujocoScene
 
-from onedemo.app import charts, progress
 from onedemo.app.services.demo_images import version_of
 from onedemo.app.services.live_rollout import Moment
-from onedemo.app.words import nobody_html
+from onedemo.app.ui import charts, progress
+from onedemo.app.ui.strings import nobody_html
 from onedemo.records import HALTED, Status
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""

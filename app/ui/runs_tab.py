@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from onedemo.app import charts
 from onedemo.app.http.uploads import form_html
+from onedemo.app.ui import charts
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
 from onedemo.records import HALTED, Status
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 _NEWEST = 6
 """Runs that are compared before anybody says which."""

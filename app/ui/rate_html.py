@@ -6,8 +6,8 @@ from html import escape
 
 from onedemo.app.annotation.rating_session import Desk
 from onedemo.app.annotation.tutorial import Lesson
-from onedemo.app.player import example_address, player_html
-from onedemo.app.words import ANSWERS, REASONS
+from onedemo.app.ui.clip_player import example_address, player_html
+from onedemo.app.ui.strings import ANSWERS, REASONS
 from onedemo.records import Demo, Status
 
 SUBMIT = '<div class="od-submit"><button type="button" class="od-button" data-submit>Submit</button></div>'

@@ -11,15 +11,15 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 from onedemo.app.annotation.comparison_session import PairDesk
-from onedemo.app.player import player_html
-from onedemo.app.pressing import Pressing
-from onedemo.app.rate_html import tools_html
 from onedemo.app.services.demo_images import version_of
-from onedemo.app.words import COMPARE_KEYS, keys_dialog
+from onedemo.app.ui.clip_player import player_html
+from onedemo.app.ui.rate_html import tools_html
+from onedemo.app.ui.strings import COMPARE_KEYS, keys_dialog
+from onedemo.app.ui.tab import Pressing
 from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 _ANSWERS = (("1", "left", "The left one"), ("2", "equal", "Both alike"), ("3", "right", "The right one"))
 

@@ -6,12 +6,12 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Any
 
-from onedemo.app.player import example_address, player_html
-from onedemo.app.words import ANSWERS, MEANINGS, keys_html
+from onedemo.app.ui.clip_player import example_address, player_html
+from onedemo.app.ui.strings import ANSWERS, MEANINGS, keys_html
 from onedemo.records import Status
 
 if TYPE_CHECKING:
-    from onedemo.app.session import Session
+    from onedemo.app.ui.session import Session
 
 log = logging.getLogger("onedemo.page")
 

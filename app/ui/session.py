@@ -18,7 +18,7 @@ from onedemo.app.annotation.tutorial import Lesson
 from onedemo.records import Rater, Status
 
 if TYPE_CHECKING:
-    from onedemo.app.server import Page
+    from onedemo.app.ui.app import Page
 
 _BRAND = (47, 93, 196)
 

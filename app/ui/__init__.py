@@ -1,0 +1,1 @@
+"""The page: one session per browser, its tabs, charts and clips."""
