@@ -24,7 +24,7 @@ def add_care_commands(commands: Any, command: Callable[..., argparse.ArgumentPar
 
 
 def _backup(arguments: argparse.Namespace) -> None:
-    from onedemo.backup import back_up
+    from onedemo.app.admin.backup import back_up
 
     file: Path = arguments.file
     check_output(file, arguments.data_dir)
@@ -39,14 +39,14 @@ def _backup(arguments: argparse.Namespace) -> None:
 
 
 def _restore(arguments: argparse.Namespace) -> None:
-    from onedemo.backup import restore
+    from onedemo.app.admin.backup import restore
 
     there = restore(arguments.file, arguments.data_dir)
     print(f"{arguments.data_dir}: {there['files']:,} files, {there['ratings']:,} ratings, links as they were")
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    from onedemo.doctor import examine
+    from onedemo.app.admin.doctor import examine
 
     wrong = 0
     for finding in examine(arguments.data_dir):

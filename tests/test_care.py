@@ -23,9 +23,9 @@ from test_demos import make_video
 from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
 
+from onedemo.app.admin.backup import MANIFEST, back_up, restore
 from onedemo.app.cli import main
 from onedemo.app.http.tokens import read_secret
-from onedemo.backup import MANIFEST, back_up, restore
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
