@@ -22,7 +22,7 @@ class Serving:
         command = [
             sys.executable,
             "-m",
-            "onedemo.app.cli",
+            "onedemo.app.cli.main",
             "serve",
             "--data-dir",
             str(self.data_dir),

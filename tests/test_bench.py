@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.experiments.speed import parts as speed
 from onedemo.experiments.speed import report
 from onedemo.experiments.speed.figures import Figure, Growth, Skipped, by_turns, ratio, single

@@ -24,7 +24,7 @@ from test_loop import headless, make_trainer
 from worlds import falling_demo, small_config
 
 from onedemo.app.admin.backup import MANIFEST, back_up, restore
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.app.http.tokens import read_secret
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
@@ -357,7 +357,7 @@ def test_the_doctor_names_what_is_wrong(data_dir, capsys, harm, said):
 
 @pytest.mark.slow
 def test_the_doctor_says_when_nothing_can_be_drawn(tmp_path):
-    command = [sys.executable, "-m", "onedemo.app.cli", "doctor", "--data-dir", str(tmp_path / "none")]
+    command = [sys.executable, "-m", "onedemo.app.cli.main", "doctor", "--data-dir", str(tmp_path / "none")]
     child = subprocess.run(command, env=os.environ | {"MUJOCO_GL": "off"}, capture_output=True, text=True)
     assert child.returncode == 1 and "BAD  pictures         cannot draw the robot" in child.stdout
     assert "none in" in child.stdout
@@ -381,7 +381,15 @@ def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, robots):
             return [(press.clip, press.value) for press in tab.presses]
 
     def save():
-        command = [sys.executable, "-m", "onedemo.app.cli", "backup", str(file), "--data-dir", str(data_dir)]
+        command = [
+            sys.executable,
+            "-m",
+            "onedemo.app.cli.main",
+            "backup",
+            str(file),
+            "--data-dir",
+            str(data_dir),
+        ]
         subprocess.run(command, check=True, capture_output=True)
 
     with serving(data_dir, ["ratings.pretrain=100"]) as server:

@@ -9,7 +9,7 @@ import sys
 import pytest
 from serving import Serving
 
-from onedemo.app.cli import _parser, main
+from onedemo.app.cli.main import _parser, main
 from onedemo.config import METHODS
 from onedemo.storage.schema import STEPS as SCHEMA
 from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, Store
@@ -99,7 +99,9 @@ def test_raters_get_links_and_lose_them(tmp_path, capsys):
 
 
 def test_help_is_quick_and_loads_nothing_heavy():
-    code = "import sys; from onedemo.app.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code = (
+        "import sys; from onedemo.app.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    )
     code += "print(sorted({'torch', 'mujoco', 'viser', 'cv2', 'numpy'} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.rstrip().endswith("[]")

@@ -17,7 +17,7 @@ import msgspec
 import pytest
 from aside import run
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.rate_limit import MESSAGES_AT_ONCE, WRONG_LINKS_AT_ONCE, Bucket, Buckets, Places
 from onedemo.app.http.tokens import hash_token, passing_link, read_span

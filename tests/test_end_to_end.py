@@ -13,7 +13,7 @@ import pytest
 from serving import Serving
 from test_page import drag_slider, opened, shown_clip, until
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.storage.store import FILE_NAME
 
 pytestmark = pytest.mark.seam

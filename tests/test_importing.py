@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from worlds import Thumbnail, falling_demo, small_config
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.config import load_config

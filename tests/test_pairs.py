@@ -12,7 +12,7 @@ from worlds import falling_demo, falling_states, small_config
 from onedemo.app.annotation.assignment import Assignment
 from onedemo.app.annotation.comparison_session import PairDesk
 from onedemo.app.annotation.rating_session import AnsweredElsewhere
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.demos.library import read_frames

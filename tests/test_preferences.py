@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.baselines import preference_reward, preferences
 from onedemo.baselines.preference_reward import Comparison, RewardConfig, fit_reward, most_disputed
 from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, draw_pairs, train_preferences

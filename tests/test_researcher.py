@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from test_page import DESKTOP, GUARD_MS, PHONE, opened, until
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import SKIPS
 from onedemo.storage.ratings import SKIP_COLUMNS
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.errors import UserError
 from onedemo.experiments import registry, runner
 from onedemo.experiments.registry import Entry, parse_seeds

@@ -7,7 +7,7 @@ from test_loop import by_rule, make_trainer
 from test_predictor import world
 from worlds import FRAMES, falling_demo, small_config
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.errors import UserError
 from onedemo.records import Segment
 from onedemo.reward.latent_track import track_basis

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from test_tables import run
 
-from onedemo.app.cli import main
+from onedemo.app.cli.main import main
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError

@@ -69,7 +69,7 @@ class Server:
         command = [
             sys.executable,
             "-m",
-            "onedemo.app.cli",
+            "onedemo.app.cli.main",
             "serve",
             "--data-dir",
             str(data_dir),

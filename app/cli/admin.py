@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from onedemo.app.cli_data import add_data_dir, check_output
+from onedemo.app.cli.data import add_data_dir, check_output
 from onedemo.errors import UserError
 
 
 def add_care_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds them to the command line. Arguments as ``onedemo.app.cli_data.add_data_commands``."""
+    """Adds them to the command line. Arguments as ``onedemo.app.cli.data.add_data_commands``."""
     save = command(commands, "backup", _backup, "everything in one file, also while the server runs")
     save.add_argument("file", type=Path, metavar="FILE", help="the archive, such as study.zip")
     save.add_argument("--force", action="store_true", help="replace FILE if it is there")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from onedemo.app.cli_data import add_data_dir, check_output, open_store
+from onedemo.app.cli.data import add_data_dir, check_output, open_store
 from onedemo.errors import UserError
 
 COMMAND_LINE = "command line"

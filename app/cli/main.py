@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from onedemo.app.bench import add_commands
-from onedemo.app.cli_care import add_care_commands
-from onedemo.app.cli_data import add_data_commands, add_data_dir, check_output, open_store
-from onedemo.app.cli_people import add_people_commands
+from onedemo.app.cli.admin import add_care_commands
+from onedemo.app.cli.bench import add_commands
+from onedemo.app.cli.data import add_data_commands, add_data_dir, check_output, open_store
+from onedemo.app.cli.people import add_people_commands
 from onedemo.errors import UserError
 
 
@@ -212,8 +212,8 @@ def _config(arguments: argparse.Namespace) -> Any:
 
 def _serve(arguments: argparse.Namespace) -> None:
     from onedemo.app.annotation.assignment import Again
+    from onedemo.app.cli.serve import serve
     from onedemo.app.http.bind import Listening
-    from onedemo.app.serve import serve
     from onedemo.demos.library import find_demo
 
     listening = Listening(
