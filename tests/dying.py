@@ -23,10 +23,10 @@ import worlds
 import onedemo.reward.episode_rules
 import onedemo.training.learner
 from onedemo.core import files
-from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
 from onedemo.training.simulated_run import train
+from onedemo.types import Demo
 
 MOMENTS = {
     "amid the first ratings": ("store", "rate", 2, True),

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.records import Demo, Segment, Status
 from onedemo.rl.rollouts import Acting, EpisodeRules
 from onedemo.storage.store import NewClip, Store
+from onedemo.types import Demo, Segment, Status
 
 FPS = 30.0
 SIZE = (360, 480)

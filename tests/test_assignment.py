@@ -11,10 +11,10 @@ import pytest
 from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
 from onedemo.app.annotation.rating_session import AnsweredElsewhere, Desk
 from onedemo.config import RatingsConfig, RunConfig
-from onedemo.records import Segment
 from onedemo.storage.ratings import Answered
 from onedemo.storage.store import NewClip, Store
 from onedemo.training.rating_queue import Asking
+from onedemo.types import Segment
 
 
 def test_the_first_free_clip_is_leased_and_stays_with_its_page():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from onedemo.queries.selection import choose
-from onedemo.records import Rollouts
+from onedemo.types import Rollouts
 
 
 def rollouts(clock):

@@ -9,8 +9,8 @@ import pytest
 
 from onedemo.app.http.tokens import hash_token, issue_link, link_token, new_session_token, read_secret
 from onedemo.errors import UserError
-from onedemo.records import Rater
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 ADA = Rater(id=1, name="ada", role="researcher")
 BO = Rater(id=2, name="bo", role="annotator")

@@ -8,10 +8,10 @@ import pytest
 
 from onedemo.annotators.base import Judge
 from onedemo.demos.frame_clock import frame_of_step
-from onedemo.records import Segment
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.segment_marks import marked_steps, seconds_of_pictures, split_marks
 from onedemo.storage.store import NewClip, RatedSegment, Store
+from onedemo.types import Segment
 
 W = 20
 

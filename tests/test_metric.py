@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from onedemo.records import Segment
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics
 from onedemo.storage.store import RatedSegment
+from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track
 
 STEPS, FRAMES = 38, 60

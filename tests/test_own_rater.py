@@ -12,11 +12,11 @@ from onedemo.annotators.oracle import make_rater
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
-from onedemo.records import Segment
 from onedemo.render.clip_image import fit
 from onedemo.render.renderer import Renderer
 from onedemo.storage.store import Store
 from onedemo.training.simulated_run import train
+from onedemo.types import Segment
 
 SOURCE = """
 import numpy as np

@@ -17,12 +17,12 @@ from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
-from onedemo.records import Segment
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.store import Store
 from onedemo.training.comparison_queue import Pairing, draw_pairs
 from onedemo.training.learner import Learner
+from onedemo.types import Segment
 
 
 def segment(value=0.0, steps=38):

@@ -16,11 +16,11 @@ from onedemo.baselines.preferences import PreferencesConfig, comparisons_due, dr
 from onedemo.baselines.synthetic_comparer import Comparer, ComparisonBudgetSpent, agreement
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.errors import UserError
-from onedemo.records import Segment
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import backflip_reward
+from onedemo.types import Segment
 
 QUICK = RewardConfig(updates=150)
 

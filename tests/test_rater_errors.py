@@ -8,7 +8,7 @@ import pytest
 from onedemo.annotators.base import Judge, RatingBudgetSpent
 from onedemo.annotators.noise import ERRORS, parse_errors
 from onedemo.errors import UserError
-from onedemo.records import Segment
+from onedemo.types import Segment
 
 N = 2000
 THRESHOLDS = (1.0, 2.0, 3.0, 4.0)  # classes one wide: 0.5 is the middle of class 5, 2.5 of class 3

@@ -9,10 +9,10 @@ from worlds import Thumbnail, falling_demo, small_config
 from onedemo.annotators.oracle import Oracle, RatingBudgetSpent, appearance, make_rater
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.records import Demo, Segment
 from onedemo.sim.vector_env import observe, spec
 from onedemo.storage.store import Store
 from onedemo.training.simulated_run import train
+from onedemo.types import Demo, Segment
 
 
 def states(steps=100, spin=-0.03):

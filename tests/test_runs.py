@@ -5,9 +5,9 @@ import pytest
 
 from onedemo.config import load_config
 from onedemo.errors import UserError
-from onedemo.records import Demo
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
+from onedemo.types import Demo
 
 DEMO = Demo(name="flip", sha256="aa", path=Path("flip.webm"), fps=30.0, frames=60, width=8, height=8)
 

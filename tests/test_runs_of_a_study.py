@@ -10,12 +10,12 @@ from onedemo.app.services import run_manager as module
 from onedemo.app.services.run_manager import Study
 from onedemo.core.files import hold
 from onedemo.errors import UserError
-from onedemo.records import Rater
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
 from onedemo.training.trainer import Trainer
+from onedemo.types import Rater
 
 pytestmark = pytest.mark.seam
 

@@ -11,9 +11,9 @@ from onedemo.annotators.oracle import make_rater
 from onedemo.annotators.scripted import Script, load_marks, marked, table_path, visible
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
-from onedemo.records import Demo, Segment
 from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
 from onedemo.training.learner import Learner
+from onedemo.types import Demo, Segment
 
 TABLE = Path(onedemo.__file__).parent / "bench" / "person_backflip.json"
 VIDEO = Path(__file__).parents[2] / "shared" / "videos" / "person_backflip_480.mp4"

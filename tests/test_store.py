@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from onedemo.errors import UserError
-from onedemo.records import Segment
 from onedemo.storage.schema import STEPS
 from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, NewClip, Store
+from onedemo.types import Segment
 
 
 def segment(value=0.0):

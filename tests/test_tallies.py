@@ -8,10 +8,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from onedemo.records import Segment
 from onedemo.storage import schema
 from onedemo.storage.schema import STEPS, migrate
 from onedemo.storage.store import FILE_NAME, NewClip, Store
+from onedemo.types import Segment
 
 RUNS = ("first", "second")
 STATES = ("cut", "ready", "withdrawn")

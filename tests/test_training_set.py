@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from onedemo.records import Segment
 from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
 from onedemo.storage.store import NewClip, Store
+from onedemo.types import Segment
 
 
 def segment(value):

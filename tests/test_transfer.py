@@ -9,7 +9,6 @@ from worlds import FRAMES, falling_demo, small_config
 
 from onedemo.app.cli.main import main
 from onedemo.errors import UserError
-from onedemo.records import Segment
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.reward.warm_start import newest_snapshot
@@ -19,6 +18,7 @@ from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
 from onedemo.training.trainer import Trainer
+from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)

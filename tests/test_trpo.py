@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.nn.utils import parameters_to_vector
 
-from onedemo.records import Rollouts
 from onedemo.rl.fisher import conjugate_gradient, fisher_product, mean_kl
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.rl.trpo import Trpo, TrpoConfig, gae
 from onedemo.sim import vector_env
+from onedemo.types import Rollouts
 
 
 def small_policy(seed=0, log_std=-0.2):

@@ -8,8 +8,8 @@ from collections.abc import Callable, Hashable
 
 from onedemo.app.annotation.assignment import Assignment, Seat
 from onedemo.app.annotation.rating_session import GUARD_SECONDS, AnsweredElsewhere
-from onedemo.records import Rater
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 
 class PairDesk:

@@ -14,9 +14,9 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 
 from onedemo.app.annotation.assignment import Ask, Assignment, Seat, to_repeat, to_share
-from onedemo.records import Rater
 from onedemo.reward.segment_marks import seconds_of_pictures
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""

@@ -14,10 +14,10 @@ from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
-from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
+from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
 
 _SWITCH_SECONDS = 0.0005

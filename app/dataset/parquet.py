@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from onedemo.app.dataset.columns import SEGMENTS
 from onedemo.errors import UserError
-from onedemo.records import ROLES, Clip, Segment
+from onedemo.types import ROLES, Clip, Segment
 
 _ARRAYS = ("obs", "actions", "qpos", "qvel")
 _RUNS, _ROLES = b"onedemo.training.runs", b"onedemo.annotators.oracle"

@@ -17,9 +17,9 @@ from onedemo.app.http import assets
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
 from onedemo.app.http.tokens import hash_token, new_session_token
-from onedemo.records import Rater
 from onedemo.storage.accounts import SESSION_DAYS, Link
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 Role = Literal["stranger", "annotator", "researcher"]

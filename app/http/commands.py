@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from onedemo.records import Rater
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 
 class Actions:

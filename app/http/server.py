@@ -27,7 +27,7 @@ from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
-from onedemo.records import Status
+from onedemo.types import Status
 
 
 class Trained(Filmed, Protocol):

@@ -15,8 +15,8 @@ from datetime import timedelta
 from pathlib import Path
 
 from onedemo.errors import UserError
-from onedemo.records import Rater
 from onedemo.storage.store import Store
+from onedemo.types import Rater
 
 SECRET_FILE = "link-secret"
 SECRET_BYTES = 32

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 
 from onedemo.demos.library import read_frames
-from onedemo.records import Demo
 from onedemo.render.clip_image import compose_clip
 from onedemo.storage.store import Store
+from onedemo.types import Demo
 
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640

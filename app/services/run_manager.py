@@ -13,13 +13,13 @@ from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
 from onedemo.core.files import hold
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
-from onedemo.records import Demo
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.model import Snapshot, check_start
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
 from onedemo.training.trainer import Trainer
+from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
 
 

@@ -28,7 +28,7 @@ from onedemo.app.services.run_manager import Study
 from onedemo.app.ui import data_tab, guide_tab, rate_tab, runs_tab, watch_tab
 from onedemo.app.ui.compare_tab import Compare
 from onedemo.app.ui.session import Session, TabMaker
-from onedemo.records import Rater
+from onedemo.types import Rater
 
 log = logging.getLogger("onedemo.page")
 

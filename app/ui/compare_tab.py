@@ -16,7 +16,7 @@ from onedemo.app.ui.clip_player import player_html
 from onedemo.app.ui.rate_html import tools_html
 from onedemo.app.ui.strings import COMPARE_KEYS, keys_dialog
 from onedemo.app.ui.tab import Pressing
-from onedemo.records import Status
+from onedemo.types import Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

@@ -14,8 +14,8 @@ from urllib.parse import quote
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.ui.charts import classes_html
 from onedemo.app.ui.strings import ANSWERS, nobody_html
-from onedemo.records import Rater, Status
 from onedemo.storage.ratings import SKIP_COLUMNS
+from onedemo.types import Rater, Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

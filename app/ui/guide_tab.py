@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from onedemo.app.ui.clip_player import example_address, player_html
 from onedemo.app.ui.strings import ANSWERS, MEANINGS, keys_html
-from onedemo.records import Status
+from onedemo.types import Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

@@ -14,7 +14,7 @@ from onedemo.app.services.demo_images import version_of
 from onedemo.app.ui import rate_html as html
 from onedemo.app.ui.strings import ANSWERS, RATE_KEYS, keys_dialog
 from onedemo.app.ui.tab import Pressing
-from onedemo.records import Status
+from onedemo.types import Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

@@ -11,7 +11,7 @@ from onedemo.app.http.uploads import form_html
 from onedemo.app.ui import charts
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
-from onedemo.records import HALTED, Status
+from onedemo.types import HALTED, Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

@@ -15,7 +15,7 @@ import viser
 
 from onedemo.app.annotation.assignment import Ask
 from onedemo.app.annotation.tutorial import Lesson
-from onedemo.records import Rater, Status
+from onedemo.types import Rater, Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.app import Page

@@ -16,7 +16,7 @@ from onedemo.app.services.demo_images import version_of
 from onedemo.app.services.live_rollout import Moment
 from onedemo.app.ui import charts, progress
 from onedemo.app.ui.strings import nobody_html
-from onedemo.records import HALTED, Status
+from onedemo.types import HALTED, Status
 
 if TYPE_CHECKING:
     from onedemo.app.ui.session import Session

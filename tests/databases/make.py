@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.records import Segment
 from onedemo.storage.schema import STEPS
 from onedemo.storage.segment_codec import pack_segment
+from onedemo.types import Segment
 
 HERE = Path(__file__).parent
 AT = "2026-01-02T03:04:05.678Z"

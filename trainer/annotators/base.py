@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from onedemo.annotators.noise import Errors, Look
-from onedemo.records import Segment
+from onedemo.types import Segment
 
 _STREAM = 1511
 """Sets a rater's random numbers apart from others that the same seed gives."""

@@ -27,9 +27,9 @@ from onedemo.annotators.base import Budget
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
-from onedemo.records import Demo, Segment
 from onedemo.render.clip_image import fit
 from onedemo.sim import vector_env
+from onedemo.types import Demo, Segment
 
 
 class OwnRater(Budget):

@@ -24,7 +24,7 @@ from onedemo.annotators.noise import Errors, parse_errors
 from onedemo.annotators.scripted import Script, load_marks, table_path
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.records import Demo, Segment
+from onedemo.types import Demo, Segment
 
 __all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appearance", "make_rater"]
 

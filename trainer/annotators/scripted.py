@@ -23,9 +23,9 @@ import numpy as np
 from onedemo.annotators.base import Judge
 from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
-from onedemo.records import Demo
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
+from onedemo.types import Demo
 
 SUFFIX = ".script.json"
 THRESHOLDS = (0.6, 0.9, 1.35, 1.9)

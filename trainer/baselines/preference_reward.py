@@ -19,8 +19,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from onedemo.records import Segment
 from onedemo.reward.two_branch_net import STANDARD_DIMS, standard_inputs
+from onedemo.types import Segment
 
 Pair = tuple[Segment, Segment]
 

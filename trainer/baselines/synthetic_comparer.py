@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.records import Segment
 from onedemo.rl.rollouts import Transitions
 from onedemo.sim.task_rewards import backflip_reward
+from onedemo.types import Segment
 
 
 class ComparisonBudgetSpent(Exception):

@@ -31,7 +31,7 @@ from onedemo.demos.import_checks import check_options
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
 from onedemo.demos.video import VideoReader, write_webm
 from onedemo.errors import UserError
-from onedemo.records import Demo
+from onedemo.types import Demo
 
 BUILT_IN = Path(static.__file__).parent / "demos"
 

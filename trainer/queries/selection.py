@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from onedemo.records import Rollouts
+from onedemo.types import Rollouts
 
 Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(lanes, starts, demo_steps), (n,) each, to predicted ratings and the disagreement on them, (n,) each."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.records import Segment
 from onedemo.storage.store import RatedSegment, Rating, Store
+from onedemo.types import Segment
 
 
 class TrainingSet:

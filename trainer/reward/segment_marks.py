@@ -15,8 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from onedemo.demos.frame_clock import frame_of_step
-from onedemo.records import Segment
 from onedemo.storage.store import RatedSegment
+from onedemo.types import Segment
 
 INSIDE, OUTSIDE = 0, 1
 """Points that the marked steps and the others differ from the rating of their clip."""

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from onedemo.records import Rollouts
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.sim import vector_env
+from onedemo.types import Rollouts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

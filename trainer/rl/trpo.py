@@ -22,9 +22,9 @@ import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from onedemo.records import Rollouts
 from onedemo.rl.fisher import conjugate_gradient, fisher_product, mean_kl
 from onedemo.rl.policy import Policy, ValueFunction
+from onedemo.types import Rollouts
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -10,9 +10,9 @@ from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 from onedemo.errors import UserError
-from onedemo.records import Rater
 from onedemo.storage.audit_log import Audit
 from onedemo.storage.database import now
+from onedemo.types import Rater
 
 SESSION_DAYS = 30
 """How long a cookie lets in."""

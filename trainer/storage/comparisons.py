@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from onedemo.records import Segment
 from onedemo.storage.database import Database, now
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
+from onedemo.types import Segment
 
 ANSWERS = ("left", "right", "equal")
 """What may be said of a pair, besides skipping it."""

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from onedemo.records import Segment
 from onedemo.storage.database import Database, now
+from onedemo.types import Segment
 
 RATING_COLUMNS = (
     "id", "clip_id", "run", "demo", "rater", "value", "stage", "iteration", "created_at",

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from onedemo.records import Segment
+from onedemo.types import Segment
 
 _NAMES = ("obs", "actions", "qpos", "qvel")
 _ZIP = b"PK"

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from onedemo.errors import UserError
-from onedemo.records import Clip, Segment
 from onedemo.storage.accounts import People
 from onedemo.storage.comparisons import Pairs
 from onedemo.storage.database import FILE_NAME, now
 from onedemo.storage.ratings import RATING_COLUMNS, Answers, RatedSegment, Rating
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
+from onedemo.types import Clip, Segment
 
 __all__ = ["FILE_NAME", "RATING_COLUMNS", "NewClip", "RatedSegment", "Rating", "Store"]
 

@@ -21,10 +21,10 @@ import numpy as np
 from onedemo.core.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
 from onedemo.demos.library import read_frames
 from onedemo.demos.video import write_webm
-from onedemo.records import Demo, Rollouts
 from onedemo.render.clip_image import side_by_side
 from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.reward.model import Snapshot
+from onedemo.types import Demo, Rollouts
 
 PARTS = 40
 """Of the demo, each with a mean rating."""

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from onedemo.core.files import read_whole, write_atomic
-from onedemo.records import Rollouts
+from onedemo.types import Rollouts
 
 _UNSEEN = ("inputs", "next_inputs")
 """What no clip is cut from, the larger part: left out."""

@@ -12,10 +12,10 @@ import numpy as np
 
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.errors import in_words
-from onedemo.records import Clip
 from onedemo.render.clip_image import compose_clip
 from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.storage.store import Store
+from onedemo.types import Clip
 
 log = logging.getLogger("onedemo")
 

@@ -14,12 +14,12 @@ import numpy as np
 
 from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
 from onedemo.queries.selection import choose
-from onedemo.records import Rollouts
 from onedemo.render.clip_image import compose_clip
 from onedemo.render.renderer import Renderer, RenderThread
 from onedemo.storage.comparisons import NewPair, Pair
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
+from onedemo.types import Rollouts
 
 log = logging.getLogger("onedemo")
 

@@ -18,7 +18,6 @@ from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
 from onedemo.queries.selection import Question, choose
-from onedemo.records import Rollouts, Segment
 from onedemo.reward.episode_rules import PracticeRules, fill_bank
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
@@ -28,6 +27,7 @@ from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.rl.trpo import Trpo
 from onedemo.sim import kinematics, vector_env
 from onedemo.storage.store import RatedSegment
+from onedemo.types import Rollouts, Segment
 from onedemo.vision.pose_estimator import Track
 
 _RANDOM_LANES = 16

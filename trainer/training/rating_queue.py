@@ -12,11 +12,11 @@ import numpy as np
 
 from onedemo.config import RunConfig
 from onedemo.errors import UserError
-from onedemo.records import Clip, Rollouts, Segment
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import NewClip, Store
 from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.learner import Learner
+from onedemo.types import Clip, Rollouts, Segment
 
 _FULL = 2 / 3
 """Share of the queue that waits before it is filled up for people."""

@@ -13,9 +13,9 @@ from onedemo.config import RunConfig, load_config, to_toml
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_name
 from onedemo.errors import UserError
-from onedemo.records import Demo
 from onedemo.storage.store import Store
 from onedemo.training.learner import lengths
+from onedemo.types import Demo
 
 
 def program_version() -> str:

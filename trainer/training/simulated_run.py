@@ -15,13 +15,13 @@ from onedemo.config import RunConfig
 from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.evaluation.episodes import summarise
-from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run, find_run, program_version
 from onedemo.training.trainer import Trainer
+from onedemo.types import Demo
 from onedemo.vision.encoders import Encoder
 
 

@@ -24,7 +24,6 @@ from onedemo.core.cpu import give_way
 from onedemo.core.files import read_whole
 from onedemo.demos.library import read_frames
 from onedemo.errors import in_words
-from onedemo.records import Demo, Rollouts, Status
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
@@ -40,6 +39,7 @@ from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.comparison_queue import Pairing
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Asking, Simulated
+from onedemo.types import Demo, Rollouts, Status
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import Track
 from onedemo.vision.pose_estimator import learn as learn_appearance

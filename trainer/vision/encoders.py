@@ -27,7 +27,7 @@ from torch import nn
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.demos.library import stream_frames
 from onedemo.errors import UserError
-from onedemo.records import Demo
+from onedemo.types import Demo
 from onedemo.vision.folded import BATCH, SIDE, Folded
 
 VGG16_URL = "https://download.pytorch.org/models/vgg16-397923af.pth"

@@ -25,12 +25,12 @@ from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation.episodes import per_episode, perform_policy
 from onedemo.experiments.jobs.method import POINTS, Watch, hidden_of, oracle_of, outcome
-from onedemo.records import Demo
 from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig
 from onedemo.sim import kinematics, vector_env
 from onedemo.training.learner import Learner
+from onedemo.types import Demo
 from onedemo.vision.pose_estimator import Track
 
 _TRPO = {"backflip": TrpoConfig(), "hop": TrpoConfig(max_kl=0.02, gamma=0.995)}

@@ -31,13 +31,13 @@ from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.evaluation.episodes import per_episode, perform, predicted_similarity, spread, state_errors
 from onedemo.experiments.runner import Job
-from onedemo.records import Demo
 from onedemo.reward.model import Snapshot
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
+from onedemo.types import Demo
 from onedemo.vision.encoders import demo_features, make_encoder
 from onedemo.vision.pose_estimator import learn as learn_appearance
 

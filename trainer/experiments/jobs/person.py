@@ -17,7 +17,7 @@ from onedemo.errors import UserError
 from onedemo.experiments.jobs import method
 from onedemo.experiments.jobs.method import whole_config
 from onedemo.experiments.runner import Job
-from onedemo.records import Demo
+from onedemo.types import Demo
 
 VIDEO = "person_backflip_480.mp4"
 VARIABLE = "ONEDEMO_PERSON_VIDEO"

@@ -17,12 +17,12 @@ from onedemo.annotators.oracle import Oracle
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.experiments.predictor_scores import spearman
 from onedemo.queries.selection import choose
-from onedemo.records import Rollouts, Segment
 from onedemo.reward.episode_rules import fill_bank
 from onedemo.reward.model import Snapshot
 from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env
 from onedemo.training.learner import Learner
+from onedemo.types import Rollouts, Segment
 
 STANDING, WILD, OTHERS, ATTEMPTS = "random, standing", "random starts", "other moves", "attempts"
 """The policies whose clips are ranked."""

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from onedemo.demos.library import read_frames
-from onedemo.records import Demo
 from onedemo.render.clip_image import SIDE_HEIGHT, SIDE_WIDTH, fit
 from onedemo.render.renderer import RenderThread
+from onedemo.types import Demo
 
 _SHOWN = 8
 _WIDTH, _HEIGHT = 180, 135

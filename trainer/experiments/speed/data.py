@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.experiments.speed.figures import Growth, Result, single
-from onedemo.records import Segment
 from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.segment_codec import pack_segment
 from onedemo.storage.store import Store
+from onedemo.types import Segment
 
 _RUN = "bench"
 _RATERS, _ITERATIONS, _WAITING = 50, 500, 20

@@ -17,10 +17,10 @@ from onedemo.config import RunConfig, load_config
 from onedemo.core.cpu import cores
 from onedemo.experiments.speed.figures import Result, by_turns, ratio, single
 from onedemo.experiments.speed.physics import Bare, full_states
-from onedemo.records import Rollouts
 from onedemo.reward.model import Snapshot
 from onedemo.storage.store import RatedSegment
 from onedemo.training.learner import Learner
+from onedemo.types import Rollouts
 
 LANES, STEPS = 64, 250
 """Of an iteration: the product's defaults."""
