@@ -59,7 +59,7 @@ def chromium() -> Iterator[Any]:
 @pytest.fixture(scope="session")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
-    from onedemo.vision import pose_estimator as appearance
+    from onedemo.vision import pose_estimator
     from onedemo.vision.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("looked") / "robots"

@@ -22,7 +22,7 @@ class Serving:
         command = [
             sys.executable,
             "-m",
-            "onedemo.app.cli.main",
+            "onedemo.app.cli",
             "serve",
             "--data-dir",
             str(self.data_dir),

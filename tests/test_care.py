@@ -357,7 +357,7 @@ def test_the_doctor_names_what_is_wrong(data_dir, capsys, harm, said):
 
 @pytest.mark.slow
 def test_the_doctor_says_when_nothing_can_be_drawn(tmp_path):
-    command = [sys.executable, "-m", "onedemo.app.cli.main", "doctor", "--data-dir", str(tmp_path / "none")]
+    command = [sys.executable, "-m", "onedemo.app.cli", "doctor", "--data-dir", str(tmp_path / "none")]
     child = subprocess.run(command, env=os.environ | {"MUJOCO_GL": "off"}, capture_output=True, text=True)
     assert child.returncode == 1 and "BAD  pictures         cannot draw the robot" in child.stdout
     assert "none in" in child.stdout
@@ -384,7 +384,7 @@ def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, robots):
         command = [
             sys.executable,
             "-m",
-            "onedemo.app.cli.main",
+            "onedemo.app.cli",
             "backup",
             str(file),
             "--data-dir",

@@ -15,7 +15,7 @@ from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
 from onedemo.training.learner import Learner
 from onedemo.types import Demo, Segment
 
-TABLE = Path(onedemo.__file__).parent / "bench" / "person_backflip.json"
+TABLE = Path(onedemo.__file__).parent / "experiments" / "jobs" / "person_backflip.json"
 VIDEO = Path(__file__).parents[2] / "shared" / "videos" / "person_backflip_480.mp4"
 DT, STEPS, W = 0.008, 275, 38
 

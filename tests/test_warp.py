@@ -233,6 +233,6 @@ def test_the_bench_counts_steps_of_both():
     assert all(len(line) == 2 and min(line) > 10 for line in taken.y.values())
     import warp
 
-    if not warp_physics.is_cuda_available():
+    if not warp.is_cuda_available():
         (skipped,) = measure(quick=True)
         assert isinstance(skipped, Skipped) and "no CUDA device" in skipped.reason

@@ -1,4 +1,7 @@
-"""What happens when somebody compares: the rules of the Compare tab, without any page. As ``onedemo.app.annotation.rating_session``."""
+"""What happens when somebody compares: the rules of the Compare tab, without any page.
+
+As ``onedemo.app.annotation.rating_session``.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The public HTTP port: one table of what there is and who may have it.
 
-``onedemo.app.http.auth`` says who asks, ``onedemo.app.http.media`` and ``onedemo.app.http.exports`` hand out files, ``onedemo.app.http.viser_proxy`` carries
+``onedemo.app.http.auth`` says who asks, ``onedemo.app.http.media`` and ``onedemo.app.http.exports`` hand
+out files, ``onedemo.app.http.viser_proxy`` carries
 the page's WebSocket to Viser. The page itself is Viser's single HTML file with our style sheet and
 key handling added.
 """

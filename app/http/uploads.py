@@ -1,6 +1,7 @@
 """A video that a researcher sends over HTTP becomes a demo.
 
-It is streamed to a file under a name of our own, decoded by a limited child (``onedemo.demos.sandboxed_decoder``) and
+It is streamed to a file under a name of our own, decoded by a limited child
+(``onedemo.demos.sandboxed_decoder``) and
 added exactly as ``onedemo demo add`` does. Whatever happens, the file is gone afterwards.
 """
 

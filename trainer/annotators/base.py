@@ -1,6 +1,7 @@
 """The rater that measures: a distance at each step of a clip, four thresholds, a budget.
 
-``onedemo.annotators.oracle.Oracle`` and ``onedemo.annotators.scripted.Script`` say what is measured; ``onedemo.annotators.noise``
+``onedemo.annotators.oracle.Oracle`` and ``onedemo.annotators.scripted.Script`` say what is measured;
+``onedemo.annotators.noise``
 what goes wrong on the way to a rating. Nothing that learns may import this module.
 
 Shapes: W control steps, q = v = 6.

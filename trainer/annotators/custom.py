@@ -88,7 +88,7 @@ class OwnRater(Budget):
             self._renderer = None
 
     def _clips(self, segment: Segment, demo_step: int) -> tuple[np.ndarray, np.ndarray]:
-        """The pictures of ``onedemo.training.clip_worker``: one of the robot for each frame of the demo's clip."""
+        """The pictures of ``training.clip_worker``: one of the robot for each frame of the demo's clip."""
         from onedemo.render.renderer import RenderThread
 
         if self._frames is None:

@@ -3,8 +3,8 @@
 ``oracle``, ``script[:TABLE.json]`` or ``package.module:Class``; the first two may be followed by error
 models, ``oracle+mistake:0.1+jitter`` (``onedemo.annotators.noise``), and by ``+seed:N``.
 
-Nothing that learns may import this module or ``onedemo.demos.ground_truth``: a rater sees the demo's states, the
-learner sees nothing but the rating.
+Nothing that learns may import this module or ``onedemo.demos.ground_truth``: a rater sees the demo's
+states, the learner sees nothing but the rating.
 
 Shapes: W control steps, q = v = 6.
 """

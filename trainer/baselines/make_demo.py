@@ -1,4 +1,6 @@
-"""Films the built-in demos anew: ``python -m onedemo.baselines.make_demo hopper-hop --task hop --source "..."``.
+"""Renders the built-in demos again.
+
+``python -m onedemo.baselines.make_demo hopper-hop --task hop --source "..."``
 
 This is the maker of a simulated demo, so it may look at the states behind it; nothing that learns
 imports this module.

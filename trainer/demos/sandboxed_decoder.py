@@ -93,7 +93,7 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
         UserError: If it is no usable video, or takes more than it may; frames may have come before.
     """
     limits = limits or Limits()
-    root = str(Path(__file__).resolve().parent.parent)
+    root = str(Path(__file__).resolve().parents[2])
     told = json.dumps([str(path.resolve()), _plain(options), limits.memory, limits.cpu_seconds])
     child = subprocess.Popen(
         [sys.executable, "-P", "-B", "-m", "onedemo.demos.sandboxed_decoder", told],

@@ -1,6 +1,7 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
-Evaluation may read hidden demo states; nothing in ``onedemo.training.learner`` or ``onedemo.training.trainer`` may.
+Evaluation may read hidden demo states; nothing in ``onedemo.training.learner`` or
+``onedemo.training.trainer`` may.
 
 Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
@@ -98,7 +99,8 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``backflip_reward``, with the actions clipped to what the motors do, and
           ``backflip_reward_raw_actions``.
         - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.sim.task_rewards``.
-        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see ``onedemo.sim.task_rewards``.
+        - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see
+            ``onedemo.sim.task_rewards``.
         - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
         - ``hop_reward``: the same rewards over the whole episode, falls or not.
         - ``upright_seconds``: until then.
@@ -142,7 +144,8 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     """How like the demo episodes are if being early or late does not count, up to ``ALIGN_SECONDS``.
 
     Each episode is laid along the demo by dynamic time warping on the oracle's distance
-    (``onedemo.evaluation.time_warping``); then every moment of the demo is rated against the episode's moment beside it.
+    (``onedemo.evaluation.time_warping``); then every moment of the demo is rated against the episode's
+    moment beside it.
 
     Args:
         qpos: Positions, (N, T, q).

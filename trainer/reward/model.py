@@ -1,7 +1,8 @@
 """The similarity predictor: from a demo frame and a robot's state and action to a rating of 1 to 5.
 
 Here is what all kinds have in common: settings, what they see of the demo, and the snapshot that a fit
-gives. ``trainer/reward/two_branch_net.py`` is the paper's network, ``trainer/reward/learned_distance.py`` a learned distance.
+gives. ``trainer/reward/two_branch_net.py`` is the paper's network, ``trainer/reward/learned_distance.py``
+a learned distance.
 
 Shapes: n clips, W control steps a clip, F demo frames, D frame features, V visual dims.
 """
@@ -116,7 +117,8 @@ class View:
     track: Track | None
     """What the frames show of the robot; None if that is not known."""
     basis: np.ndarray
-    """Functions of the frames that an unknown track is made of (``trainer/reward/latent_track.py``), (F, R), float32."""
+    """Functions of the frames that an unknown track is made of (``trainer/reward/latent_track.py``), (F,
+    R), float32."""
     fps: float
     """Frames per second."""
     lens: Lens | None = None

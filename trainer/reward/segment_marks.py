@@ -1,7 +1,8 @@
 """Where a clip goes wrong: a marked stretch is learned from as worse than the rest of its clip.
 
 The paper leaves this to future work. The metric takes the marked steps to be further off than the others
-(``trainer/reward/learned_distance.py``). For the network, a rating with a mark becomes two: the others get a point more.
+(``trainer/reward/learned_distance.py``). For the network, a rating with a mark becomes two: the others get
+a point more.
 Each part is drawn out to the length of a clip by repeating steps, so that a fit need not know of marks.
 
 Shapes: n ratings, W control steps a clip.

@@ -1,8 +1,8 @@
 """Batched MuJoCo environments behind ``gymnasium.vector.VectorEnv``, and the registry of them.
 
 All lanes are stepped by one call, into MuJoCo's C++ thread pool (``mujoco.rollout``) or into the
-optional ``trainer/sim/warp_physics.py``; nothing here loops over lanes in Python. A lane's whole physical state
-is (time, qpos, qvel): the contact solver's warm start is cleared before each control step, so a
+optional ``trainer/sim/warp_physics.py``; nothing here loops over lanes in Python. A lane's whole physical
+state is (time, qpos, qvel): the contact solver's warm start is cleared before each control step, so a
 state that was saved and put back goes on exactly as it would have.
 
 Shapes: N lanes, o observations, a actions, q = v positions and velocities, S = 1 + q + v.

@@ -220,7 +220,7 @@ STEPS: tuple[str, ...] = (
             ), 0)
             WHERE id = new.clip_id;
     END;
-    ALTER TABLE clips ADD COLUMN choice TEXT NOT NULL DEFAULT '';  -- why it is asked; trainer/queries/selection.py
+    ALTER TABLE clips ADD COLUMN choice TEXT NOT NULL DEFAULT '';  -- why it is asked; queries/selection.py
     ALTER TABLE clips ADD COLUMN score REAL;  -- by what it was chosen
     ALTER TABLE raters ADD COLUMN practised_at TEXT;  -- when the practice clips were done
     -- The ratings that hold, one row each; second opinions have repeat 1.

@@ -114,8 +114,8 @@ class Asking:
     def _fill_once(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> bool:
         """Cuts as many clips as are missing from the queue; True if some still are.
 
-        A few at a time, because one alone cannot be a mix of kinds (``trainer/queries/selection.py``). While the
-        first iteration runs people go on with random motion, so that nobody waits.
+        A few at a time, because one alone cannot be a mix of kinds (``trainer/queries/selection.py``).
+        While the first iteration runs people go on with random motion, so that nobody waits.
         """
         if self.clips is not None:
             self.clips.retry()

@@ -1,7 +1,7 @@
 """What the method is compared with: rewards that somebody wrote, comparisons, and the true rating.
 
-Each gives the same kind of result as ``onedemo.experiments.jobs.method``. Settings: ``demo``, which the episodes are
-compared with, and ``steps`` of practice, and those named below.
+Each gives the same kind of result as ``onedemo.experiments.jobs.method``. Settings: ``demo``, which the
+episodes are compared with, and ``steps`` of practice, and those named below.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
 
     Args:
         settings: And ``method``: "paper" practises by a fixed clock from standing starts, "onedemo" with
-            an elastic clock, a bank of starts and giving up; and ``set``, as in ``onedemo.experiments.jobs.method``.
+            an elastic clock, a bank of starts and giving up; and ``set``, as in
+            ``onedemo.experiments.jobs.method``.
         seed: Of everything random.
         scratch: Not used.
 

@@ -1,7 +1,7 @@
 """The job behind the case study: a video of a real person, and a rater that goes by hand-made marks.
 
-Settings of a job are those of ``onedemo.experiments.jobs.method`` without ``demo``; the rater "script", which errors
-may follow, goes by the marks beside this file. The video is not part of this program.
+Settings of a job are those of ``onedemo.experiments.jobs.method`` without ``demo``; the rater "script",
+which errors may follow, goes by the marks beside this file. The video is not part of this program.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ VIDEO = "person_backflip_480.mp4"
 VARIABLE = "ONEDEMO_PERSON_VIDEO"
 MARKS = Path(__file__).with_name("person_backflip.json")
 
-_FOLDER = Path(__file__).parents[2].parent / "shared" / "videos"
+_FOLDER = Path(__file__).parents[3].parent / "shared" / "videos"
 _DEMO = "person-backflip"
 
 
@@ -61,7 +61,7 @@ def person_job(
 
 
 def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | None = None) -> dict[str, Any]:
-    """Trains on the person's video and evaluates: arguments and result as ``onedemo.experiments.jobs.method.run``."""
+    """Trains on the person's video and evaluates: arguments and result as ``jobs.method.run``."""
     cache = cache or scratch
     with hold(cache / "lock", wait=True):
         demo = person_demo(cache / "demos")

@@ -46,8 +46,8 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         cache: As for ``onedemo.experiments.jobs.method.run``.
 
     Returns:
-        What ``onedemo.experiments.jobs.method.run`` gives of the target run; ``source`` holds the ratings, control
-        steps and seconds of the other.
+        What ``onedemo.experiments.jobs.method.run`` gives of the target run; ``source`` holds the ratings,
+        control steps and seconds of the other.
     """
     cache = cache or scratch
     given, before = settings["source"], scratch / "source"

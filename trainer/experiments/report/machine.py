@@ -15,7 +15,7 @@ _PACKAGES = (
     "mujoco", "gymnasium", "torch", "numpy", "viser", "opencv-python-headless", "envpool", "sb3-contrib",
     "mujoco-warp",
 )  # fmt: skip
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).parents[3]
 
 
 def machine() -> dict[str, Any]:

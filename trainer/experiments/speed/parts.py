@@ -11,7 +11,7 @@ from onedemo.experiments.speed.figures import Result, Skipped
 from onedemo.experiments.speed.physics import MISSING
 
 PARTS = ("physics", "training", "sb3", "fitting", "pictures", "data", "product", "crowd", "painted", "warp")
-"""Modules of ``onedemo.bench``; each has ``measure(quick) -> list[Result]``."""
+"""Modules of ``onedemo.experiments.speed``; each has ``measure(quick) -> list[Result]``."""
 
 
 _PEERS = ("sb3_contrib", "stable_baselines3")
@@ -38,7 +38,7 @@ def measure(
     for part in parts:
         began = time.monotonic()
         try:
-            results += importlib.import_module(f"onedemo.bench.{part}").measure(quick)
+            results += importlib.import_module(f"onedemo.experiments.speed.{part}").measure(quick)
         except Exception as error:
             if isinstance(error, ImportError) and (error.name or "").split(".")[0] in _PEERS:
                 results.append(Skipped(name=part, reason=MISSING.format(error.name)))

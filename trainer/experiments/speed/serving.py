@@ -69,7 +69,7 @@ class Server:
         command = [
             sys.executable,
             "-m",
-            "onedemo.app.cli.main",
+            "onedemo.app.cli",
             "serve",
             "--data-dir",
             str(data_dir),

@@ -114,7 +114,7 @@ def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
         Text(
             f"The tumbling demo of 8 s, {settings['ratings']} ratings of a rater without error. **{seeds} "
             f"{'seed' if seeds == 1 else 'seeds'} and {settings['steps']:,} control steps of practice**: "
-            f"fewer than in the table of methods (5 seeds, {backflip_table.STEPS:,} steps). Figures are of "
+            f"fewer than in the table of methods (5 seeds, {backflip.STEPS:,} steps). Figures are of "
             "16 episodes of the final policy. With so few seeds, a difference within their spread is none."
         ),
         *_part(groups, _OURS, "without", "onedemo without each part"),

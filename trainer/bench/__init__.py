@@ -1,1 +1,0 @@
-"""Measurements: what the program costs beside its peers and the machine's limit. Peers: extra ``[bench]``."""
