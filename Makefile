@@ -8,6 +8,7 @@ OPTIONS ?=
 BIN := .venv/bin
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 
 .PHONY: run setup test test-fast check chaos soak bench clean
 
@@ -30,24 +31,27 @@ test-fast: .venv/.installed-test
 check: .venv/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	@rm -rf build/typed && mkdir -p build/typed && cp -R trainer build/typed/onedemo && cp -R app static build/typed/onedemo
 	$(BIN)/pyright --level error --pythonpath $(BIN)/python
 
 # What the tests do in seconds, for long: 20 minutes, and two hours. Tables of figures are left in promises/.
 chaos: .venv/.installed-test
 	@mkdir -p promises
-	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/test_resume.py tests/test_faults.py
-	PYTHONPATH=. $(BIN)/python tests/check_door.py --json promises/door.json
-	PYTHONPATH=. $(BIN)/python tests/check_kill.py --json promises/kill.json
-	@$(BIN)/python tests/promises.py promises/chaos.md promises/kill.json promises/door.json
+	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
+	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
+	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
+	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json
 
 soak: .venv/.installed-test
 	@mkdir -p promises
-	PYTHONPATH=. $(BIN)/python tests/check_soak.py --json promises/soak.json
-	@$(BIN)/python tests/promises.py promises/soak.md promises/soak.json
+	PYTHONPATH=tests $(BIN)/python tests/load/soak_server.py --json promises/soak.json
+	@$(BIN)/python tests/load/promises.py promises/soak.md promises/soak.json
 
 bench: .venv/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/onedemo bench speed --json speed.json --out speed-report
+	PYTHONPATH=tests $(BIN)/onedemo bench speed --part load.data --part load.product --part load.crowd \
+	  --part load.painted --json speed-server.json --out speed-report/server
 
 clean:
 	rm -rf .venv *.egg-info .pytest_cache .ruff_cache
@@ -57,9 +61,9 @@ clean:
 	  { echo "onedemo needs Python 3.11 or newer; name one with: make PYTHON=python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 
-.venv/.installed: pyproject.toml | .venv/bin/python
+.venv/.installed: pyproject.toml constraints.txt | .venv/bin/python
 	@echo "installing onedemo into .venv (a few minutes the first time)"
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --quiet --editable '.[app]'
 	@touch $@
 
 .venv/.installed-test: .venv/.installed tests/install-system.sh

@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-# Before anything imports mujoco: there is no screen.
-os.environ.setdefault("MUJOCO_GL", "egl")
+from onedemo.core.process import prepare_process
+
+prepare_process()  # as every program of onedemo does, before NumPy and MuJoCo are imported
 if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by the tests side by side
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -40,7 +41,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A real headless Chromium, launched by Playwright."""
-    from onedemo.experiments.speed.painted import CHROMIUM_FLAGS, find_chromium
+    from load.painted import CHROMIUM_FLAGS, find_chromium
 
     path = find_chromium()
     if path is None:
@@ -97,8 +98,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setattr(
         "onedemo.app.services.live_rollout.FRAMES_PER_SECOND", 5.0
     )  # without a GPU each costs a tenth of a second
-    from standin import StandIn
-
+    from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
     from onedemo.app.http.bind import Listening
     from onedemo.app.http.server import Front

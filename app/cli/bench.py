@@ -60,7 +60,7 @@ def _speed(arguments: argparse.Namespace) -> int:
     from onedemo.experiments.speed import parts as speed
     from onedemo.experiments.speed import report
 
-    unknown = set(arguments.parts or ()) - set(speed.PARTS)
+    unknown = {part for part in arguments.parts or () if "." not in part} - set(speed.PARTS)
     if unknown:
         raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(speed.PARTS)}")
     _check_outputs(arguments)

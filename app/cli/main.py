@@ -16,11 +16,13 @@ from onedemo.app.cli.admin import add_care_commands
 from onedemo.app.cli.bench import add_commands
 from onedemo.app.cli.data import add_data_commands, add_data_dir, check_output, open_store
 from onedemo.app.cli.people import add_people_commands
+from onedemo.core.process import prepare_process
 from onedemo.errors import UserError
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line and returns the exit code: 0, or 2 for bad input."""
+    prepare_process()
     try:
         arguments = _parser().parse_args(argv)
         return arguments.run(arguments) or 0

@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
+from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
-from onedemo.app.ui.strings import ANSWERS
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
 

@@ -184,7 +184,7 @@ def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
     return [rate_tab.Rate, *([Compare] if compare else []), guide_tab.Guide]
 
 
-# Viser's private names, all of them; tests/test_server.py holds them.
+# Viser's private names, all of them; tests/system/test_viser_private.py holds them.
 
 
 def lock_down(server: viser.ViserServer) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from onedemo.app.ui.strings import ANSWERS
+from onedemo.app.annotation.scale import ANSWERS
 
 _TRUE_REWARD = "True reward (points; never trained on)"
 _POINTS = 1500

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
+from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.ui.charts import classes_html
-from onedemo.app.ui.strings import ANSWERS, nobody_html
+from onedemo.app.ui.strings import nobody_html
 from onedemo.storage.ratings import SKIP_COLUMNS
 from onedemo.types import Rater, Status
 

@@ -6,8 +6,9 @@ import logging
 import threading
 from typing import TYPE_CHECKING, Any
 
+from onedemo.app.annotation.scale import ANSWERS, MEANINGS
 from onedemo.app.ui.clip_player import example_address, player_html
-from onedemo.app.ui.strings import ANSWERS, MEANINGS, keys_html
+from onedemo.app.ui.strings import keys_html
 from onedemo.types import Status
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from html import escape
 
 from onedemo.app.annotation.rating_session import Desk
+from onedemo.app.annotation.scale import ANSWERS, REASONS
 from onedemo.app.annotation.tutorial import Lesson
 from onedemo.app.ui.clip_player import example_address, player_html
-from onedemo.app.ui.strings import ANSWERS, REASONS
 from onedemo.types import Demo, Status
 
 SUBMIT = '<div class="od-submit"><button type="button" class="od-button" data-submit>Submit</button></div>'

@@ -10,9 +10,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from onedemo.app.annotation.rating_session import Desk
+from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.services.demo_images import version_of
 from onedemo.app.ui import rate_html as html
-from onedemo.app.ui.strings import ANSWERS, RATE_KEYS, keys_dialog
+from onedemo.app.ui.strings import RATE_KEYS, keys_dialog
 from onedemo.app.ui.tab import Pressing
 from onedemo.types import Status
 

@@ -11,14 +11,12 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from onedemo.errors import UserError
 
 log = logging.getLogger("onedemo")
-
-_UMASK = os.umask(0)  # there is no way to ask without setting; once, before there are threads
-os.umask(_UMASK)
 
 
 def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
@@ -51,7 +49,7 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=suffix)
     temporary = Path(name)
     try:
-        os.fchmod(handle, 0o666 & ~_UMASK)  # mkstemp makes files that nobody else can read
+        os.fchmod(handle, 0o666 & ~umask())  # mkstemp makes files that nobody else can read
         yield temporary
         os.fsync(handle)
         os.replace(temporary, path)
@@ -149,3 +147,15 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
                 f"another onedemo is working on {path.parent}; stop it, or choose another --run or --data-dir"
             ) from None
         yield
+
+
+@cache
+def umask() -> int:
+    """The permissions that new files of this process lack, as it was when first asked for."""
+    try:
+        line = next(line for line in Path("/proc/self/status").read_text().splitlines() if "Umask" in line)
+        return int(line.split()[1], 8)
+    except (OSError, StopIteration):  # elsewhere there is no way to ask without setting it for a moment
+        mask = os.umask(0)
+        os.umask(mask)
+        return mask

@@ -8,6 +8,8 @@ Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from onedemo.annotators.oracle import Oracle, appearance
@@ -26,7 +28,6 @@ from onedemo.sim.task_rewards import (
     turned,
     until_fall,
 )
-from onedemo.training.learner import Learner
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6
@@ -41,8 +42,29 @@ _EVERY = 4
 """Control steps between the moments that are aligned: about a frame."""
 
 
+class Trained(Protocol):
+    """What is evaluated: a ``training.learner.Learner``."""
+
+    @property
+    def env(self) -> str:
+        """Name of the robot."""
+        ...
+
+    def policy(self) -> PolicySnapshot:
+        """The current policy."""
+        ...
+
+    def rules(self, lanes: int, snapshot: Snapshot | None = None) -> EpisodeRules:
+        """How the demo phase moves in so many episodes."""
+        ...
+
+    def frames_of(self, demo_steps: np.ndarray) -> np.ndarray:
+        """The demo frame on screen at control steps: same shape."""
+        ...
+
+
 def summarise(
-    learner: Learner, snapshot: Snapshot | None, oracle: Oracle | None
+    learner: Trained, snapshot: Snapshot | None, oracle: Oracle | None
 ) -> dict[str, dict[str, float] | None]:
     """Figures of the current policy over 16 deterministic episodes, each {mean, best, worst}.
 
@@ -60,10 +82,10 @@ def summarise(
     return {name: spread(name, values) for name, values in (figures | per_episode(episodes, oracle)).items()}
 
 
-def perform(learner: Learner, snapshot: Snapshot | None) -> Episodes:
+def perform(learner: Trained, snapshot: Snapshot | None) -> Episodes:
     """The 16 episodes of the current policy; the snapshot moves an elastic clock."""
     rules = learner.rules(EPISODES, snapshot) if snapshot is not None else None
-    return perform_policy(learner.policy(), env_name=learner.config.env, rules=rules)
+    return perform_policy(learner.policy(), env_name=learner.env, rules=rules)
 
 
 def perform_policy(
@@ -74,7 +96,7 @@ def perform_policy(
 
 
 def predicted_similarity(
-    learner: Learner, snapshot: Snapshot | None, episodes: Episodes
+    learner: Trained, snapshot: Snapshot | None, episodes: Episodes
 ) -> np.ndarray | None:
     """Mean predicted rating of the steps of each episode, by its own clock, (N,)."""
     if snapshot is None:

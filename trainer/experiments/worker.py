@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from onedemo.core.files import write_atomic
+from onedemo.core.process import prepare_process
 from onedemo.experiments.report.document import plain
 from onedemo.experiments.report.machine import machine, now, program
 
@@ -70,4 +71,5 @@ def _end_with_parent(scratch: Path) -> None:
 
 
 if __name__ == "__main__":
+    prepare_process()
     main(sys.argv[1])

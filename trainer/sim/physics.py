@@ -14,8 +14,6 @@ from mujoco import rollout
 
 from onedemo.sim import physics_profiling
 
-physics_profiling.switch_off()
-
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
@@ -64,9 +62,12 @@ class RolloutPhysics:
         frame_skip: Physics steps in a control step.
         num_envs: Lanes.
         nthread: Threads beside the caller's; 0 for none.
+
+    Switches MuJoCo's profiling off in this process (``physics_profiling``).
     """
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, num_envs: int, nthread: int) -> None:
+        physics_profiling.switch_off()
         self._models = [model] * num_envs
         self._frame_skip = frame_skip
         self._data = [mujoco.MjData(model) for _ in range(max(nthread, 1))]

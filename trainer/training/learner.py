@@ -110,6 +110,11 @@ class Learner:
                 shown = np.pad(shown, ((0, 0), (0, _TABLE_DIMS - shown.shape[1])))
             self._policy.table = self._ahead(shown)
 
+    @property
+    def env(self) -> str:
+        """Name of the robot."""
+        return self.config.env
+
     def policy(self) -> PolicySnapshot:
         """The current policy, as a copy that any thread may use."""
         return self._policy.snapshot()

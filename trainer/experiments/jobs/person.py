@@ -23,21 +23,24 @@ VIDEO = "person_backflip_480.mp4"
 VARIABLE = "ONEDEMO_PERSON_VIDEO"
 MARKS = Path(__file__).with_name("person_backflip.json")
 
-_FOLDER = Path(__file__).parents[3].parent / "shared" / "videos"
 _DEMO = "person-backflip"
 
 
 def video() -> Path:
-    """The person's video: what the variable names, else where a source tree has it beside it.
+    """The person's video, which the environment variable ``ONEDEMO_PERSON_VIDEO`` names.
 
     Raises:
         UserError: If it is not there.
     """
-    path = Path(os.environ.get(VARIABLE) or _FOLDER / VIDEO)
-    if not path.is_file():
-        where = f"{VARIABLE}={path}" if os.environ.get(VARIABLE) else f"../shared/videos/{VIDEO}"
-        raise UserError(f"there is no video at {where}; name it with the environment variable {VARIABLE}")
-    return path
+    named = os.environ.get(VARIABLE, "")
+    if not named:
+        raise UserError(
+            f"the video of the person ({VIDEO}) is no part of onedemo; name its file with the environment "
+            f"variable {VARIABLE}"
+        )
+    if not Path(named).is_file():
+        raise UserError(f"there is no video at {VARIABLE}={named}")
+    return Path(named)
 
 
 def person_demo(demos_dir: Path) -> Demo:

@@ -206,7 +206,7 @@ def _against_gymnasium(turns: int, steps: int, quick: bool) -> list[Result]:
 
 def stock_hopper() -> gymnasium.Env:
     """Hopper-v5 as gymnasium has it."""
-    # In a process of its own, importing this module has switched profiling off: as shipped, it is on.
+    # In a process of its own, which its parent may have forked with profiling off: as shipped, it is on.
     if multiprocessing.parent_process() is not None:
         physics_profiling.switch_on()
     return gymnasium.make("Hopper-v5")

@@ -1,0 +1,331 @@
+"""What an annotator does besides pressing 1 to 5, on two screens: practice, slow motion, marks, reasons."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from browser.test_page import DESKTOP, GUARD_MS, PHONE, drawn, opened, press_and_wait, shown_clip, until
+
+pytestmark = pytest.mark.seam
+
+BOTH = pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+
+
+def frame_of(page) -> int:
+    return int(page.locator(".od-clip .od-player").get_attribute("data-frame"))
+
+
+def marks_of(site) -> list[tuple]:
+    return site.trainer.store.rows(
+        "SELECT clip_id, value, mark_start, mark_end FROM events WHERE kind = 'rate' ORDER BY id"
+    )
+
+
+@BOTH
+def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromium, site, viewport):
+    from onedemo.app.http.tokens import issue_link, read_secret
+
+    store = site.trainer.store
+    new = store.ensure_rater("new", "annotator")
+    link = issue_link(store, read_secret(store.path.parent), new, site.url)
+    with opened(chromium, link, viewport) as page:
+        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
+        page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
+        page.keyboard.press("ArrowRight")  # both sides stand still
+        assert np.abs(np.subtract(drawn(page, "left"), drawn(page, "right"))).max() < 40
+        page.keyboard.press("2")
+        page.wait_for_selector(".od-feedback >> text=You gave 2; most people would give 5 or 4.")
+        assert not page.locator(".od-answers").is_visible()
+        page.keyboard.press("Enter")
+        page.wait_for_selector(".od-progress >> text=Practice 2 of 2")
+        page.wait_for_selector(".od-answers")
+        page.click('.od-answers [data-key="1"]')
+        page.wait_for_selector(".od-feedback >> text=1 is right.")
+        page.click("[data-go]")
+        clip = shown_clip(page)
+        assert site.events() == []
+        assert press_and_wait(page, site, lambda: page.keyboard.press("3")) == ("rate", clip, 3, "new")
+        page.reload()
+        shown_clip(page)  # not again
+        page.click('.od-tabs >> text="Guide"')
+        page.click("text=Practise again")
+        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
+        page.keyboard.press("s")
+        shown_clip(page)
+        assert len(site.events()) == 1
+
+
+@BOTH
+def test_slow_motion_steps_and_replay(chromium, site, viewport):
+    with opened(chromium, site.links["annotator"], viewport) as page:
+        shown_clip(page)
+        page.keyboard.press("ArrowRight")
+        here, before = frame_of(page), drawn(page, "right")
+        page.wait_for_timeout(300)
+        assert frame_of(page) == here  # a step stands still
+        page.keyboard.press("ArrowLeft")
+        if here > 0:
+            assert frame_of(page) == here - 1 and drawn(page, "right") != before
+        for _ in range(12):
+            page.keyboard.press("ArrowRight")
+        assert frame_of(page) == 9
+        page.click('[data-step="-1"]')
+        assert frame_of(page) == 8
+        assert page.locator("[data-slow]").get_attribute("aria-pressed") == "false"
+        page.keyboard.press("f")
+        page.wait_for_selector('[data-slow][aria-pressed="true"]')
+        seconds = page.evaluate(
+            """() => new Promise(done => {
+                const player = document.querySelector('.od-clip .od-player'), began = performance.now();
+                document.querySelector('[data-replay]').click();
+                new MutationObserver((_, o) => {
+                  if (player.dataset.frame !== '9') return;
+                  o.disconnect();
+                  done((performance.now() - began) / 1000);
+                }).observe(player, { attributes: true });
+            })"""
+        )
+        assert 1.0 < seconds < 3.0  # nine thirtieths of a second, at a quarter of the speed
+        clip = shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("4"))
+        shown_clip(page)
+        assert page.locator("[data-slow]").get_attribute("aria-pressed") == "true"  # it stays on
+        assert site.events() == [("rate", clip, 4, "bo")]
+
+
+@BOTH
+def test_a_mark_by_dragging_goes_with_the_rating(chromium, site, viewport):
+    with opened(chromium, site.links["annotator"], viewport, has_touch=viewport is PHONE) as page:
+        clip = shown_clip(page)
+        box = page.locator("[data-track]").bounding_box()
+        y = box["y"] + box["height"] / 2
+        page.mouse.move(box["x"] + 0.31 * box["width"], y)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 0.55 * box["width"], y, steps=4)
+        page.mouse.up()
+        page.wait_for_selector(".od-bar-note >> text=Goes wrong from 0.10 to 0.20 s")
+        press_and_wait(page, site, lambda: page.keyboard.press("2"))
+        assert marks_of(site) == [(clip, 2, 0.104, 0.2)]  # pictures 3 to 5: steps 13 to 24
+        second = shown_clip(page)
+        page.mouse.click(box["x"] + 0.75 * box["width"], y)  # a tap shows that moment and marks nothing
+        assert frame_of(page) == 7
+        press_and_wait(page, site, lambda: page.keyboard.press("5"))
+        assert marks_of(site)[1:] == [(second, 5, None, None)]
+
+
+def mark_by_dragging(page, start, end):
+    box = page.locator("[data-track]").bounding_box()
+    y = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + start * box["width"], y)
+    page.mouse.down()
+    page.mouse.move(box["x"] + end * box["width"], y, steps=4)
+    page.mouse.up()
+
+
+def test_a_mark_is_there_again_after_another_tab_after_undo_and_on_the_last_picture(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        mark_by_dragging(page, 0.95, 1.2)
+        words = page.wait_for_selector(".od-bar-note >> text=Goes wrong from 0.30 to 0.33 s").inner_text()
+        page.wait_for_timeout(GUARD_MS)
+        page.click('.od-tabs >> text="Guide"')
+        page.wait_for_selector(".od-scale")
+        page.click('.od-tabs >> text="Rate"')
+        shown_clip(page)
+        assert page.locator(".od-bar-note").inner_text() == words
+        assert page.locator(".od-wrong").bounding_box()["width"] > 10
+        press_and_wait(page, site, lambda: page.keyboard.press("2"))
+        shown_clip(page)
+        assert "Goes wrong" not in page.locator(".od-bar-note").inner_text()
+        press_and_wait(page, site, lambda: page.keyboard.press("u"))
+        assert shown_clip(page) == clip and page.locator(".od-bar-note").inner_text() == words
+        press_and_wait(page, site, lambda: page.keyboard.press("1"))
+        assert marks_of(site) == [(clip, 2, 0.304, 0.328), (clip, 1, 0.304, 0.328)]
+
+
+def test_no_rating_goes_without_its_mark(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        page.route("**/note", lambda route: route.abort())
+        mark_by_dragging(page, 0.05, 0.15)
+        page.wait_for_selector(".od-bar-note >> text=could not be saved")
+        assert page.locator(".od-wrong").bounding_box()["width"] > 10  # still there
+        page.keyboard.press("2")
+        page.click('.od-answers [data-key="3"]')
+        page.wait_for_timeout(GUARD_MS)
+        assert site.events() == []
+        page.unroute("**/note")
+        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", clip, 4, "bo")
+        assert marks_of(site) == [(clip, 4, 0.0, 0.072)]
+
+
+def test_a_held_enter_on_a_button_gives_one_rating(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        page.focus('.od-answers [data-key="4"]')
+        for _ in range(40):  # without an up in between: held
+            page.keyboard.down("Enter")
+            page.wait_for_timeout(30)
+        page.keyboard.up("Enter")
+        page.wait_for_timeout(GUARD_MS)
+        assert site.events() == [("rate", clip, 4, "bo")]
+
+
+def test_a_mark_by_keys_and_taking_it_away(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        for _ in range(10):
+            page.keyboard.press("ArrowLeft")
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("m")
+        for _ in range(2):
+            page.keyboard.press("ArrowRight")
+        page.keyboard.press("m")
+        page.keyboard.press("3")  # at once: the mark must be there first
+        until(site.events)
+        assert marks_of(site) == [(clip, 3, 0.04, 0.136)]  # pictures 1 to 3: steps 5 to 16
+        shown_clip(page)
+        page.keyboard.press("m")
+        page.keyboard.press("m")
+        page.click("[data-unmark]")
+        page.wait_for_selector(".od-bar-note >> text=Drag where it goes wrong")
+        press_and_wait(page, site, lambda: page.keyboard.press("3"))
+        assert marks_of(site)[1][2:] == (None, None)
+
+
+@BOTH
+def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site, viewport):
+    def reasons():
+        return site.trainer.store.rows("SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id")
+
+    with opened(chromium, site.links["annotator"], viewport) as page:
+        shown_clip(page)
+        place = page.locator(".od-clip").bounding_box()
+        press_and_wait(page, site, lambda: page.keyboard.press("s"))
+        asked = page.locator(".od-notice").bounding_box()  # in plain sight, and nothing moves
+        assert page.locator(".od-clip").bounding_box() == place
+        assert asked["y"] >= 0 and asked["y"] + asked["height"] <= place["y"]
+        page.click(".od-notice >> text=It is too short to tell")
+        page.wait_for_selector(".od-notice >> text=Noted. Thank you.")
+        page.wait_for_timeout(1200)  # the page is drawn anew twice a second
+        assert page.locator(".od-notice").inner_text() == "Noted. Thank you."
+        shown_clip(page)
+        press_and_wait(page, site, lambda: page.click('.od-tools [data-key="s"]'))
+        shown_clip(page)
+        before = len(site.events())
+        page.click(".od-notice input")
+        page.keyboard.type("12345 s u m f ? <b>")
+        page.wait_for_timeout(GUARD_MS)
+        assert len(site.events()) == before and not page.locator(".od-help").is_visible()
+        page.keyboard.press("Enter")
+        page.wait_for_selector(".od-notice >> text=Noted. Thank you.")
+        assert reasons() == [("It is too short to tell",), ("12345 s u m f ? <b>",)]
+
+
+def test_the_keys_are_shown_and_meanwhile_nothing_is_rated(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        page.keyboard.press("?")
+        page.wait_for_selector(".od-help >> text=slow motion, on and off")
+        for key in ("3", "s", "u"):
+            page.keyboard.press(key)
+        page.wait_for_timeout(GUARD_MS)
+        assert site.events() == []
+        page.keyboard.press("Escape")
+        page.wait_for_selector(".od-help", state="hidden")
+        assert press_and_wait(page, site, lambda: page.keyboard.press("3")) == ("rate", clip, 3, "bo")
+        shown_clip(page)
+        page.click("[data-help]")
+        page.wait_for_selector(".od-help")
+        page.click(".od-help >> text=Close")
+        page.wait_for_selector(".od-help", state="hidden")
+
+
+def test_with_reduced_motion_clips_play_once_on_space(chromium, site):
+    with opened(chromium, site.links["annotator"], reduced_motion="reduce") as page:
+        page.wait_for_selector(".od-clip [data-frame]")
+        page.wait_for_timeout(600)
+        assert frame_of(page) == 0
+        page.keyboard.press("Space")
+        page.wait_for_selector('.od-clip [data-frame="9"]')
+        page.wait_for_timeout(1200)
+        assert frame_of(page) == 9
+        clip = int(page.locator(".od-clip .od-player").get_attribute("data-clip"))
+        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", clip, 4, "bo")
+
+
+def test_everything_can_be_done_with_the_keyboard_and_the_focus_is_seen(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        reached = set()
+        for _ in range(30):
+            page.keyboard.press("Tab")
+            name, outline = page.evaluate(
+                "() => { const e = document.activeElement;"
+                " const ours = e.matches('button, a, input, [role=slider]');"
+                " const name = ours ? e.getAttribute('aria-label') || e.textContent : '';"
+                " return [name.trim(), getComputedStyle(e).outlineStyle] }"
+            )
+            if name:
+                reached.add(name.split(" ")[0])
+                assert outline != "none", name
+            if name.startswith("4") and not site.events():
+                press_and_wait(page, site, lambda: page.keyboard.press("Enter"))
+                assert site.events() == [("rate", clip, 4, "bo")]
+                assert page.evaluate("() => document.activeElement.textContent").startswith("4")
+        assert {
+            "Rate",
+            "Guide",
+            "1Not",
+            "5The",
+            "Rating",
+            "Submit",
+            "Skip",
+            "Replay",
+            "Slow",
+            "Keys",
+        } <= reached
+
+
+def test_undo_outlives_a_reload(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("1"))
+        page.reload()
+        shown_clip(page)
+        assert press_and_wait(page, site, lambda: page.keyboard.press("u")) == ("undo", clip, None, "bo")
+        assert shown_clip(page) == clip
+
+
+def test_notes_of_others_clips_and_hostile_notes_change_nothing(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        path = page.evaluate("() => location.pathname") + "/note"
+
+        def post(body, **options):
+            return page.request.post(
+                f"{site.url}{path}", data=body, headers={"Origin": site.url}, **options
+            ).status
+
+        good = {"clip": clip, "mark": [0, 3]}
+        assert post(good) == 204
+        assert post({**good, "clip": clip + 5}) == 409
+        assert post({"clip": clip, "reason": "not skipped"}) == 409
+        for bad in (
+            {}, [], "x", {"clip": clip}, {**good, "more": 1}, {**good, "clip": "1"}, {**good, "clip": True},
+            {**good, "mark": [0.1]}, {**good, "mark": ["0", "1"]}, {**good, "mark": [5, 1]},
+            {**good, "mark": [0.5, 1]}, {**good, "mark": [9, 11]}, {**good, "mark": [-1, 2]},
+            {"clip": clip, "reason": 7}, {"clip": clip, "reason": ""}, {"clip": clip, "reason": "a\nb"},
+        ):  # fmt: skip
+            assert post(bad) == 400, bad
+        assert post({"clip": clip, "reason": "x" * 70_000}) == 413
+        elsewhere = page.request.post(
+            f"{site.url}{path}", data=good, headers={"Origin": "http://evil.example"}
+        )
+        assert elsewhere.status == 403
+        nobody = page.context.browser.new_context()
+        assert nobody.request.post(f"{site.url}{path}", data=good, headers={"Origin": site.url}).status == 401
+        nobody.close()
+        press_and_wait(page, site, lambda: page.keyboard.press("3"))
+        assert marks_of(site) == [(clip, 3, 0.0, 0.104)]

@@ -1,0 +1,119 @@
+"""A small training in a process of its own that may die: ``dying.py DIRECTORY METHOD RATER MOMENT``.
+
+It begins, or goes on from what is on disk, and ends by SIGKILL at the moment, or when it is done if that
+is "". ``outcome`` is what it leaves behind. For ``test_resume.py``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import sqlite3
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import onedemo.reward.episode_rules
+import onedemo.training.learner
+from helpers import small_world
+from onedemo.core import files
+from onedemo.reward.model import Snapshot
+from onedemo.storage.store import FILE_NAME, Store
+from onedemo.training.simulated_run import train
+from onedemo.types import Demo
+
+MOMENTS = {
+    "amid the first ratings": ("store", "rate", 2, True),
+    "in a fit": ("learner", "fit", 2, False),
+    "between a snapshot and its row": ("snapshot", "save", 2, True),
+    "in the first iteration": ("learner", "iterate", 1, False),
+    "with half a checkpoint": ("os", "replace", 2, False),
+    "between a checkpoint and its row": ("os", "replace", 1, True),
+    "between two iterations": ("store", "add_iteration", 2, True),
+    "with questions asked and not answered": ("store", "add_clips", 1, True),
+    "after an answer": ("store", "rate", 1, True),
+}
+"""Where a process dies: whose method, its name, at which call in that process, before or after it."""
+
+
+def die() -> None:
+    """Ends this process as a power cut would."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def arm(moment: str) -> None:
+    """Sees to it that this process dies at that moment."""
+    owner, name, call, after = MOMENTS[moment]
+    where = {"store": Store, "snapshot": Snapshot, "os": files.os, "learner": onedemo.learner.Learner}[owner]
+    whole, calls = getattr(where, name), 0
+
+    def dying(*args, **kwargs):
+        nonlocal calls
+        calls += name != "replace" or Path(args[1]).name == "checkpoint.pt"
+        if calls == call and not after:
+            die()
+        result = whole(*args, **kwargs)
+        if calls == call:
+            die()
+        return result
+
+    setattr(where, name, dying)
+
+
+def practise(data_dir: Path, method: str, rater: str) -> None:
+    """The training, from whatever is on disk."""
+    onedemo.learner._WILD_LANES, onedemo.practice._BANK_TRIES = 4, 200
+    config = small_world.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
+    demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
+    demo = replace(demo, path=Path(demo.path))
+    with closing(Store(data_dir)) as store:
+        train(
+            store=store, data_dir=data_dir, demo=demo, config=config, encoder=small_world.Thumbnail(),
+            rater=rater, name="r", progress=False,
+        )  # fmt: skip
+
+
+def outcome(data_dir: Path) -> dict:
+    """What a training leaves behind, but for times."""
+    with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:
+        rows = {
+            "ratings": "SELECT clip_id, kind, value, mark_start, mark_end FROM events ORDER BY id",
+            "clips": "SELECT id, demo_step, stage, iteration, snapshot, predicted, choice, score FROM clips",
+            "segments": "SELECT clip_id, hex(data) FROM segments ORDER BY clip_id",
+            "snapshots": "SELECT number, last_event, ratings FROM snapshots ORDER BY number",
+        }
+        found: dict[str, Any] = {name: [list(row) for row in db.execute(sql)] for name, sql in rows.items()}
+        curve = db.execute("SELECT number, snapshot, env_steps, stats FROM iterations ORDER BY number")
+        found["curve"] = [[*row, {**json.loads(stats), "steps_per_s": 0}] for *row, stats in curve]
+    found["segments"] = [
+        [clip, hashlib.sha256(data.encode()).hexdigest()] for clip, data in found["segments"]
+    ]
+    saved = torch.load(data_dir / "runs" / "r" / "checkpoint.pt", weights_only=True)
+    digest = hashlib.sha256()
+
+    def add(value: object) -> None:
+        if isinstance(value, dict):
+            for key in value:
+                digest.update(str(key).encode())
+                add(value[key])
+        elif isinstance(value, torch.Tensor):
+            digest.update(value.contiguous().numpy().tobytes())
+        else:
+            digest.update(repr(value).encode())
+
+    add(saved["learner"])
+    found["learner"] = digest.hexdigest()
+    return found
+
+
+if __name__ == "__main__":
+    directory, method, rater, moment = sys.argv[1:]
+    if moment:
+        arm(moment)
+    practise(Path(directory), method, rater)

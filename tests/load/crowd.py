@@ -1,0 +1,72 @@
+"""Many people at once for a while: how long they wait, what it costs in memory, whether a rating is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from load.serving import Stocked, bring, stocked
+from onedemo.experiments.speed.figures import Result, Skipped, single
+
+PEOPLE = 50
+EVERY_S = 4.0
+SECONDS = 180.0
+_SETTLE_S = 5.0
+"""Seconds that all pages are open before memory is read for the first time."""
+
+
+def measure(quick: bool) -> list[Result]:
+    """Everything of this module.
+
+    Args:
+        quick: For a few seconds instead of three minutes.
+    """
+    if sys.platform != "linux":
+        return [Skipped(name="crowd", reason="memory of a server is measured on Linux only")]
+    with tempfile.TemporaryDirectory(prefix="onedemo-bench-") as place:
+        return asyncio.run(_measure(Path(place) / "data", 12.0 if quick else SECONDS))
+
+
+async def _measure(data_dir: Path, seconds: float) -> list[Result]:
+    async with stocked(data_dir, presses=int(PEOPLE * seconds / EVERY_S), people=PEOPLE) as study:
+        return await crowd(study, people=PEOPLE, every_s=EVERY_S, seconds=seconds)
+
+
+async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) -> list[Result]:
+    """People who all rate at a steady pace while the robot practises.
+
+    Args:
+        study: With clips in stock for all.
+        people: How many.
+        every_s: Seconds from press to press of each.
+        seconds: How long.
+
+    Raises:
+        RuntimeError: If a rating was lost or doubled, or practice stood still.
+    """
+    await bring(study.session, study.server, "online")
+    await study.open(people)
+    await asyncio.sleep(_SETTLE_S)
+    before, start = study.iterations(), study.server.resident_mib()
+    taken = await study.rate(every_s, seconds)
+    end, iterations = study.server.resident_mib(), study.iterations() - before
+    study.check()
+    if not iterations:
+        raise RuntimeError("the robot did not practise meanwhile")
+    count = len(taken)
+    how = (
+        f"{people} sockets, each a rating every {every_s:g} s for {seconds:g} s, {iterations} iterations of "
+        f"practice meanwhile; {count} ratings counted in the database; clips drawn before, copies of a few"
+    )
+    return [
+        single("crowd_press_ms", f"press to next clip and its picture, 95th percentile, {people} people",
+               [float(np.percentile(taken, 95))], unit="ms", how=how),
+        single("crowd_press_median_ms", "the same, median", [float(np.median(taken))], unit="ms", how=how),
+        single("crowd_lost", f"ratings lost or doubled, of {count}", [0.0], unit="", reach=0, how=how),
+        single("crowd_memory_start_mib", "memory of the server as they begin", [start], unit="MiB", how=how),
+        single("crowd_memory_end_mib", "memory of the server at the end", [end], unit="MiB", how=how),
+    ]  # fmt: skip

@@ -1,0 +1,159 @@
+"""Hostile video files, really made: refused in one sentence, by a child that takes no more than it may."""
+
+import os
+import re
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from onedemo.demos import sandboxed_decoder
+from onedemo.demos.sandboxed_decoder import Limits, Options, decode
+from onedemo.errors import UserError
+from unit.demos.test_library import make_video, refused
+
+pytestmark = pytest.mark.seam
+
+SMALL = Limits(memory=1 << 30, cpu_seconds=5, wall_seconds=10)
+
+
+@pytest.fixture
+def library(tmp_path):
+    return tmp_path / "demos"
+
+
+def peak_mb():
+    return int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1]) / 1024
+
+
+def huge_gif(path):
+    """80 bytes that claim 30000 x 30000 pixels."""
+    screen = b"GIF89a" + struct.pack("<HHBBB", 30000, 30000, 0x80, 0, 0) + b"\0\0\0\xff\xff\xff"
+    image = b"\x21\xf9\x04\0\x0a\0\0\0\x2c" + struct.pack("<HHHHB", 0, 0, 30000, 30000, 0)
+    path.write_bytes(screen + (image + b"\x02\x02\x4c\x01\0") * 2 + b"\x3b")
+
+
+def huge_jpegs(path):
+    """Motion JPEG whose pictures claim 30000 x 30000 pixels."""
+    picture = cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes()
+    at = picture.index(b"\xff\xc0") + 5
+    path.write_bytes((picture[:at] + struct.pack(">HH", 30000, 30000) + picture[at + 4 :]) * 30)
+
+
+def endless_avi(path):
+    """Ten frames that claim to be ten million."""
+    content = bytearray(make_video(path, count=10).read_bytes())
+    content[0x30:0x34] = struct.pack("<I", 10_000_000)
+    at = content.index(b"strh") + 8
+    content[at + 32 : at + 36] = struct.pack("<I", 10_000_000)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("make", "suffix", "words"),
+    [
+        (huge_gif, ".gif", "is not a video|cannot be decoded|may have at most 4096"),
+        (huge_jpegs, ".mjpeg", "is not a video|cannot be decoded|may have at most 4096"),
+        (endless_avi, ".avi", "longer than 60 s"),
+    ],
+)
+def test_a_bomb_is_refused_without_growing(tmp_path, library, make, suffix, words):
+    path = tmp_path / f"bomb{suffix}"
+    make(path)
+    before = peak_mb()
+    assert re.search(words, refused(path, library, limits=SMALL))
+    assert peak_mb() - before < 40
+
+
+def test_more_frames_than_anybody_needs(tmp_path, library, monkeypatch):
+    monkeypatch.setattr("onedemo.demos.import_checks.MAX_FRAMES", 20)
+    with pytest.raises(UserError, match="more than 20 frames"):
+        list(sandboxed_decoder.shaped_frames(make_video(tmp_path / "a.avi", count=30), Options()))
+
+
+def test_memory_processor_time_and_wall_time_are_limited(tmp_path, library):
+    large = make_video(tmp_path / "large.avi", count=40, size=(3000, 2000), picture=lambda i, w, h: BLANK)
+    assert "needs more memory" in refused(large, library, limits=Limits(memory=100 << 20))
+    assert "longer than 1 s to decode" in refused(large, library, limits=Limits(cpu_seconds=1))
+    start = time.monotonic()
+    assert "longer than 0.5 s to decode" in refused(large, library, limits=Limits(wall_seconds=0.5))
+    assert time.monotonic() - start < 3
+
+
+BLANK = np.zeros((2000, 3000, 3), np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["playlist", "list of files"])
+def test_a_file_that_names_other_files_is_no_video(tmp_path, library, kind):
+    make_video(tmp_path / "other.avi", count=30)
+    if kind == "playlist":
+        path = tmp_path / "list.m3u8"
+        path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1.0,\nother.avi\n#EXT-X-ENDLIST\n")
+    else:
+        path = tmp_path / "list.mp4"
+        path.write_text("ffconcat version 1.0\nfile other.avi\n")
+    assert "is not a video" in refused(path, library)
+
+
+def test_the_child_is_gone_when_nobody_wants_more(tmp_path):
+    frames = decode(make_video(tmp_path / "a.avi", count=90, size=(640, 480)), Options())
+    next(frames)
+    assert _children()
+    frames.close()
+    assert not _children()
+    assert not [t for t in threading.enumerate() if isinstance(t, threading.Timer)]
+
+
+def _children():
+    listing = [p.read_text() for p in Path("/proc").glob("[0-9]*/cmdline") if _mine(p.parent)]
+    return [line for line in listing if "onedemo.demos.sandboxed_decoder" in line]
+
+
+def _mine(process):
+    try:
+        return f"PPid:\t{os.getpid()}\n" in (process / "status").read_text()
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import os; os.abort()",
+        "print('S', end='')",
+        "import os; os.write(1, b'S' + bytes([255, 255, 255, 255]) + b'F' * 99)",
+        "import os; os.write(1, b'S' + bytes([16, 0, 16, 0]) + b'F' + b'x' * 700)",
+        "import os; os.write(1, b'D')",
+        "import os\nos.write(1, b'S' + bytes([2, 0, 2, 0]))\nwhile True: os.write(1, b'F' + b'x' * 12)",
+        "import os; os.write(1, b'garbage' * 1000)",
+    ],
+)
+def test_whatever_the_child_says_is_checked(tmp_path, library, monkeypatch, code):
+    """As if a decoder had been taken over: its process says what it likes, and dies as it likes."""
+    child = subprocess.Popen
+    monkeypatch.setattr(
+        sandboxed_decoder.subprocess,
+        "Popen",
+        lambda command, **how: child([sys.executable, "-c", code], **how),
+    )
+    assert "cannot be decoded" in refused(make_video(tmp_path / "a.avi", count=3), library)
+
+
+def test_the_child_knows_nothing_of_its_parent(tmp_path, monkeypatch):
+    """Neither the environment nor open files."""
+    seen = {}
+    child = subprocess.Popen
+    monkeypatch.setattr(
+        sandboxed_decoder.subprocess,
+        "Popen",
+        lambda command, **how: seen.update(how) or child(command, **how),
+    )
+    monkeypatch.setenv("SECRET", "x")
+    list(decode(make_video(tmp_path / "a.avi", count=3), Options()))
+    assert "SECRET" not in seen["env"] and seen.get("close_fds", True) and not seen.get("shell")

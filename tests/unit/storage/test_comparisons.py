@@ -1,0 +1,261 @@
+"""Pairs: which of two clips is nearer. Store, rules of the tab, how they are made, what learns."""
+
+import csv
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from helpers.small_world import falling_demo, falling_states, small_config
+from onedemo.app.annotation.assignment import Assignment
+from onedemo.app.annotation.comparison_session import PairDesk
+from onedemo.app.annotation.rating_session import AnsweredElsewhere
+from onedemo.app.cli.main import main
+from onedemo.app.dataset.columns import COMPARISONS
+from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
+from onedemo.demos.library import read_frames
+from onedemo.errors import UserError
+from onedemo.render.renderer import RenderThread
+from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
+from onedemo.storage.store import Store
+from onedemo.training.comparison_queue import Pairing, draw_pairs
+from onedemo.training.learner import Learner
+from onedemo.types import Segment
+from unit.queries.test_selection import rollouts
+
+
+def segment(value=0.0, steps=38):
+    sizes = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
+    return Segment(**{name: np.full((steps, size), value) for name, size in sizes.items()})
+
+
+@pytest.fixture
+def store(tmp_path):
+    with closing(Store(tmp_path)) as store:
+        store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+        yield store
+
+
+@pytest.fixture
+def pairs(store):
+    new = [
+        NewPair(demo_step=7 * i, left=segment(i), right=segment(-i), stage="online", iteration=3)
+        for i in range(4)
+    ]
+    ids = [pair.id for pair in store.add_pairs("r", new)]
+    store.set_pair_state(ids, "ready")
+    return ids
+
+
+def test_answers_hold_until_they_are_taken_back(store, pairs):
+    ann, bob = (store.ensure_rater(name, "annotator").id for name in ("Ann", "Bob"))
+    store.compare(pairs[0], ann, "left", 900)
+    store.compare(pairs[1], ann, "skip", 900)
+    store.compare(pairs[2], bob, "equal", 900)
+    assert [p.id for p in store.waiting_pairs("r")] == [pairs[3]]
+    with pytest.raises(ValueError, match="answered already"):
+        store.compare(pairs[0], ann, "right", 900)
+    store.compare(pairs[0], ann, "undo", 0)
+    with pytest.raises(ValueError, match="nothing to take back"):
+        store.compare(pairs[0], ann, "undo", 0)
+    store.compare(pairs[0], ann, "right", 700)
+    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.iter_comparisons("r")]
+    assert [(row["pair_id"], row["rater"], row["answer"]) for row in rows] == [
+        (pairs[2], "Bob", "equal"), (pairs[0], "Ann", "right"),
+    ]  # fmt: skip
+    assert store.count_comparisons("r") == 2 and store.count_comparisons("other") == 0
+    for answer in ("both", "", None):
+        with pytest.raises(ValueError, match="left, right, equal"):
+            store.compare(pairs[3], ann, answer, 0)
+    with pytest.raises(ValueError, match="no pair 99"):
+        store.compare(99, ann, "left", 0)
+    for change in ("UPDATE comparisons SET answer = 'left'", "DELETE FROM comparisons"):
+        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+            store.rows(change)
+    left, right = store.pair_segments(pairs[1])
+    assert left.qpos[0, 0] == 1 and right.qpos[0, 0] == -1
+
+
+class Clock:
+    now = 10.0
+
+    def __call__(self):
+        return self.now
+
+
+def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
+    clock, assignment = Clock(), Assignment()
+    bo, cy = (
+        PairDesk(store, "r", store.ensure_rater(name, "annotator"), assignment, name, clock)
+        for name in ("bo", "cy")
+    )
+    bo.refill()
+    cy.refill()
+    assert (bo.current, bo.upcoming, cy.current, cy.upcoming) == tuple(pairs)
+    assert not bo.answer(pairs[0], "left")  # too soon
+    clock.now += 0.4
+    assert not bo.answer(pairs[1], "left")  # not on screen
+    assert bo.answer(pairs[0], "left") and bo.current == pairs[1] and bo.upcoming is None
+    clock.now += 0.4
+    assert bo.answer(pairs[1], "skip") and bo.current is None
+    assert bo.undo() and bo.current == pairs[1] and bo.undo() and bo.current == pairs[0]
+    assert bo.upcoming == pairs[1] and not bo.undo()
+    clock.now += 0.4
+    assert bo.answer(pairs[0], "right") and bo.current == pairs[1]
+    cy.close()
+    clock.now += 0.4
+    assert bo.answer(pairs[1], "equal") and bo.current == pairs[2]
+
+
+def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):
+    clock, assignment = Clock(), Assignment()
+    bo, cy = (store.ensure_rater(name, "annotator") for name in ("bo", "cy"))
+    gone = PairDesk(store, "r", bo, assignment, 1, clock)
+    gone.refill()  # and its line breaks without a word
+    back = PairDesk(store, "r", bo, assignment, 2, clock)
+    other = PairDesk(store, "r", cy, assignment, 3, clock)
+    other.refill()
+    assert (other.current, other.upcoming) == (pairs[2], pairs[3])
+    back.refill()
+    assert (back.current, back.upcoming) == (pairs[0], pairs[1])
+    clock.now += 200
+    late = PairDesk(store, "r", store.ensure_rater("di", "annotator"), assignment, 4, clock)
+    late.refill()
+    assert (late.current, late.upcoming) == (pairs[0], pairs[1])  # the leases have ended
+    assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
+
+
+def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(store, pairs):
+    clock, assignment = Clock(), Assignment()
+    bo = store.ensure_rater("bo", "annotator")
+    laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock) for page in ("laptop", "phone"))
+    laptop.refill()
+    clock.now += 121  # the lease has ended
+    phone.refill()
+    clock.now += 1
+    assert phone.current == laptop.current == pairs[0] and phone.answer(pairs[0], "left")
+    with pytest.raises(AnsweredElsewhere, match="at another page of yours"):
+        laptop.answer(pairs[0], "right")
+    moved_to = laptop.current
+    assert moved_to not in (None, pairs[0]) and not laptop.can_undo
+    clock.now += 1
+    assert laptop.answer(moved_to, "equal")
+    assert [(row[1], row[5]) for row in store.iter_comparisons()] == [(pairs[0], "left"), (moved_to, "equal")]
+
+
+def test_pairs_are_beside_one_moment_of_the_demo_and_no_clip_is_in_two():
+    clock = np.tile(np.arange(200), (16, 1)) + 10 * np.arange(16)[:, None]
+    whole = rollouts(clock)
+    rng = np.random.default_rng(0)
+    for any_time in (False, True):
+        drawn = draw_pairs(whole, 6, 38, 1000, rng, any_time=any_time)
+        assert len(drawn) == 6
+        places = [place for _, left, right in drawn for place in (left, right)]
+        assert len(set(places)) == 12
+        for demo_step, left, right in drawn:
+            assert 0 <= demo_step <= 1000 - 38
+            if not any_time:
+                for lane, start in (left, right):
+                    assert abs(clock[lane, start] - demo_step) <= 8
+    assert draw_pairs(whole, 0, 38, 1000, rng, any_time=True) == []
+
+
+@pytest.mark.seam
+def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
+    import cv2
+
+    demo = falling_demo(tmp_path / "demo")
+    learner = Learner(small_config(), demo.frames, demo.fps)
+    with RenderThread() as drawing:
+        pairing = Pairing(store, "r", tmp_path / "pairs", read_frames(demo), drawing, seed=0)
+        pairing.fill(learner, learner.random_rollouts())
+        assert store.waiting_pairs("r", "cut") == []  # nobody looks
+        pairing.want()
+        pairing.fill(learner, None)
+        pairing.fill(learner, learner.random_rollouts())
+        drawing.submit(lambda renderer: None).result()
+        ready = store.waiting_pairs("r")
+        assert len(ready) == 6
+        picture = cv2.imread(str(pairing.file(ready[0].id)))
+        assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
+        robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
+        assert np.abs(robots[0] - robots[1]).max() > 60
+        left, _ = store.pair_segments(ready[0].id)
+        _, first = np.unique(
+            learner.frames_of(ready[0].demo_step + np.arange(ready[0].steps)), return_index=True
+        )
+        drawn = drawing.submit(lambda renderer: renderer.render(left.qpos[first])).result()[0]
+        apart = [np.abs(robot[..., ::-1] - drawn.astype(int)).mean() for robot in robots]
+        assert apart[0] < 2 < apart[1]  # the left one is on the left
+        pairing.fill(learner, learner.random_rollouts())
+        assert len(store.waiting_pairs("r")) == 6  # the queue is full
+
+        # A process that died: one pair answered, one without its picture, one with a damaged one, one that
+        # was still to be drawn.
+        answered, lost, damaged, *rest = (pair.id for pair in ready)
+        content = bytearray(pairing.file(damaged).read_bytes())
+        content[len(content) // 2] ^= 1
+        pairing.file(damaged).write_bytes(content)
+        store.compare(answered, store.ensure_rater("Ann", "annotator").id, "left", 900)
+        pairing.file(lost).unlink()
+        new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
+        undrawn = store.add_pairs("r", [new])[0].id
+        after = Pairing(store, "r", tmp_path / "pairs", read_frames(demo), drawing, seed=0)
+        after.want()
+        after.fill(learner, learner.random_rollouts())
+        drawing.submit(lambda renderer: None).result()
+        waiting = [pair.id for pair in store.waiting_pairs("r")]
+        assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
+        assert all(pairing.file(pair).exists() for pair in waiting)
+        assert store.waiting_pairs("r", "cut") == [] and store.count_comparisons("r") == 1
+
+
+def test_a_policy_learns_from_what_people_compared(store):
+    states = falling_states()
+    rater = store.ensure_rater("Ann", "annotator").id
+    rng = np.random.default_rng(0)
+    cuts = [int(t) for t in rng.integers(0, 200, size=40)]
+
+    def cut(t):
+        noise = rng.normal(size=(38, 11)) * 0.1
+        return Segment(
+            obs=states.obs[t : t + 38] + noise, actions=np.zeros((38, 3)), qpos=states.qpos[t : t + 38],
+            qvel=states.qpos[t : t + 38],
+        )  # fmt: skip
+
+    new = [
+        NewPair(demo_step=0, left=cut(a), right=cut(b), stage="pretrain", iteration=0)
+        for a, b in zip(cuts[::2], cuts[1::2], strict=True)
+    ]
+    for pair, (a, b) in zip(store.add_pairs("r", new), zip(cuts[::2], cuts[1::2], strict=True), strict=True):
+        store.compare(pair.id, rater, "left" if a > b else "right", 900)
+    given = stored_comparisons(store, "r")
+    assert [c.preference for c in given] == [float(a > b) for a, b in zip(cuts[::2], cuts[1::2], strict=True)]
+    config = PreferencesConfig(
+        steps=2000, lanes=4, batch=250, horizon=250, threads=1, evaluate_every=9, segment_seconds=0.3
+    )
+    trained = train_preferences(config, given=given, progress=False)
+    assert trained.curve[-1].comparisons == len(given) == 20
+    late, early = (
+        trained.reward.rewards(states.obs[t][None], np.zeros((1, 38, 3))).mean() for t in (LATE, EARLY)
+    )
+    assert late > early
+    for run, words in (("none", "there are: r"), ("q", "nobody has compared")):
+        if run == "q":
+            store.add_run(run="q", demo="d", demo_sha256="0", seed=0, config="", version="0")
+        with pytest.raises(UserError, match=words):
+            stored_comparisons(store, run)
+
+
+EARLY, LATE = slice(0, 38), slice(200, 238)
+
+
+def test_comparisons_are_exported(store, pairs, tmp_path):
+    store.compare(pairs[0], store.ensure_rater("=Ann", "annotator").id, "left", 900)
+    out = tmp_path / "pairs.csv"
+    assert main(["export", "--data-dir", str(store.path.parent), "--comparisons", str(out)]) == 0
+    with out.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert tuple(row) == tuple(COMPARISONS) == COMPARISON_COLUMNS
+    assert (row["answer"], row["rater"], row["steps"]) == ("left", "'=Ann", "38")

@@ -1,0 +1,101 @@
+"""What is kept of an iteration, and what is drawn of it when somebody asks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.small_world import falling_demo, falling_states
+from onedemo.app.ui.progress import chosen, gallery_html, timeline_html
+from onedemo.demos.video import VideoReader, count_frames
+from onedemo.render.renderer import RenderThread
+from onedemo.training.best_rollouts import PARTS, Episode, Gallery
+from unit.queries.test_selection import rollouts as empty_rollouts
+
+
+class ByLane:
+    """Rates lane k with 1 + k, a point less in the second half of the demo."""
+
+    def ratings(self, frames, obs, actions):
+        return 1.0 + np.arange(len(frames))[:, None] - (frames >= 120)
+
+
+def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there(tmp_path):
+    clock = np.tile(np.arange(200, 700), (3, 1)).astype(np.int32)
+    gallery = Gallery(tmp_path, None, 0.008, None)
+    told = gallery.note(1, ByLane(), empty_rollouts(clock), lambda steps: steps * 240 // 1000, 1000)
+    parts = told["timeline"]
+    assert len(parts) == PARTS and "best" not in told  # no episode ended
+    assert [k for k, part in enumerate(parts) if part is not None] == list(range(8, 28))
+    assert parts[8:20] == [2.0] * 12 and parts[20:28] == [1.0] * 8
+
+
+def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_quarter_of_one(tmp_path):
+    """Two lanes, episodes of 1000 steps in iterations of 250; the second lane is 100 steps behind."""
+    clocks = (np.arange(2000)[None] - np.array([[0], [100]])) % 1000
+    gallery = Gallery(tmp_path, None, 0.008, None)
+    kept = []
+    for k in range(8):
+        part = empty_rollouts(np.arange(250)[None] * np.ones((2, 1)))
+        clock = clocks[:, 250 * k : 250 * (k + 1)].astype(np.int32)
+        qpos = np.repeat(clock[..., None], 6, axis=2).astype(float)
+        part = replace(part, clock=clock, qpos=qpos, truncated=clock == 999)
+        told = gallery.note(k + 1, ByLane(), part, lambda steps: steps * 240 // 1000, 1000)
+        kept.append(told.get("best"))
+    # The episodes under way when it began to look are not whole; nor is the second lane's of 100 steps.
+    assert [k for k, best in enumerate(kept) if best is not None] == [4, 7]
+    assert kept[4] == pytest.approx(1.5, abs=0.01) and kept[7] == pytest.approx(0.5, abs=0.01)
+    for iteration in (5, 8):
+        with np.load(tmp_path / f"{iteration:06d}.npz") as data:
+            assert data["qpos"][:, 0].tolist() == list(range(1000))
+            assert data["frames"].tolist() == [t * 240 // 1000 for t in range(1000)]
+
+
+def test_a_long_attempt_is_better_than_a_good_moment():
+    short = Episode(np.zeros((10, 6)), np.arange(10), np.full(2, 4.0))
+    long = Episode(np.zeros((1000, 6)), np.arange(1000), np.full(200, 3.0))
+    assert long.worth > short.worth
+
+
+@pytest.mark.seam
+def test_the_best_rollout_is_drawn_when_asked_for_and_once(tmp_path):
+    import cv2
+
+    demo = falling_demo(tmp_path / "demo")
+    states = falling_states()
+    with RenderThread() as drawing:
+        gallery = Gallery(tmp_path / "rollouts", demo, 0.008, drawing)
+        gallery.keep(7, states.qpos[:125], np.arange(125) * 30 * 8 // 1000)
+        strip = gallery.file(7, "jpg")
+        picture = cv2.imread(str(strip))
+        assert picture.shape == (120, 960, 3)
+        assert np.abs(picture[:, :160].astype(int) - picture[:, -160:]).max() > 60  # it falls
+        video = gallery.file(7, "webm")
+        assert count_frames(video) == 30  # a second
+        with VideoReader(video) as reader:
+            _, frame = next(iter(reader.frames()))
+            assert frame.shape == (360, 972, 3)
+        written = video.stat().st_mtime_ns
+        assert gallery.file(7, "webm").stat().st_mtime_ns == written
+        with pytest.raises(FileNotFoundError):
+            gallery.file(8, "jpg")
+    assert sorted(f.suffix for f in (tmp_path / "rollouts").iterdir()) == [".jpg", ".npz", ".webm"]
+
+
+def test_the_strip_names_the_weakest_part_and_what_was_not_reached():
+    rows = [{"number": 1, "timeline": [1.0, 3.0, 2.0, None]}, {"number": 2}]
+    html = timeline_html(rows, 8.0)
+    assert "iteration 1; between 1.0 and 3.0; weakest at 1.0 s; 2.0 s not reached (dashed)" in html
+    assert html.count("<i style=") == 3 and "6.0 to 8.0 s: not reached" in html and "--od-rated:50%" in html
+    assert "no part was reached" in timeline_html([{"number": 1, "timeline": [None]}], 8.0)
+    assert "iteration" not in timeline_html([], 8.0)
+
+
+def test_the_gallery_shows_the_newest_and_some_of_all_before():
+    assert chosen([1, 2, 3]) == [3, 2, 1]
+    shown = chosen(list(range(1, 626)))
+    assert len(shown) == 12 and shown[0] == 625 and shown[-1] == 1 and shown == sorted(shown, reverse=True)
+    rows = [{"number": k, "best": 2.0 + k / 10} for k in range(1, 4)]
+    html = gallery_html(rows, "r")
+    assert html.index("Iteration 3") < html.index("Iteration 1") and "predicted rating 2.3" in html
+    assert gallery_html([{"number": 1}], "r") == ""
