@@ -292,7 +292,7 @@ def test_a_table_from_command_to_report(tiny_table, capsys):
     text = Path("report/report.md").read_text()
     assert "`onedemo bench tiny`" in text and "The quick form" in text and about["date"][:10] in text
     assert "| whole | 0, 1 | 2 of 2 |" in text
-    assert {"heights.svg", "report.html"} <= {file.name for file in Path("report").iterdir()}
+    assert {"heights.svg", "report.md"} <= {file.name for file in Path("report").iterdir()}
 
     # Partial: one seed more, not run.
     assert main("bench tiny --quick --seeds 3 --results kept --report-only".split()) == 0

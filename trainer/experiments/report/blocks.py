@@ -204,8 +204,3 @@ def file_name(figure: Figure) -> str:
 def alt_text(figure: Figure) -> str:
     """What is to be seen."""
     return figure.alt if isinstance(figure, Picture) else figure.title
-
-
-def is_wide(figure: Figure) -> bool:
-    """Whether it takes the whole width."""
-    return isinstance(figure, Bars) or figure.wide

@@ -1,4 +1,4 @@
-"""A report, written as Markdown, HTML, JSON and charts in SVG, or as text for a terminal."""
+"""A report, written as Markdown, JSON and charts in SVG, or as text for a terminal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ from onedemo.experiments.report.blocks import (
     shown,
 )
 from onedemo.experiments.report.machine import machine, now, program
-from onedemo.experiments.report.page import as_html
 
 
 def about(*, command: str, seconds: float | None = None, **more: Any) -> dict[str, Any]:
@@ -73,7 +72,7 @@ def record(document: Document) -> dict[str, Any]:
 
 
 def write(document: Document, out: Path) -> None:
-    """Writes ``report.md``, ``report.html``, ``results.json``, and each chart and picture.
+    """Writes ``report.md``, ``results.json``, and each chart and picture.
 
     The same document gives the same files, byte by byte.
 
@@ -94,7 +93,6 @@ def write(document: Document, out: Path) -> None:
             write_atomic(out / file_name(block), draw(block))
     write_atomic(out / "results.json", (json.dumps(record(document), indent=1) + "\n").encode())
     write_atomic(out / "report.md", _markdown(document).encode())
-    write_atomic(out / "report.html", as_html(document).encode())
 
 
 def as_text(document: Document) -> str:

@@ -57,7 +57,7 @@ def table(results: Sequence[Result]) -> str:
 
 
 def write_report(out: Path, title: str, results: Sequence[Result], about: dict[str, Any]) -> None:
-    """Writes ``report.md``, ``report.html``, ``results.json`` and one chart for each growth.
+    """Writes ``report.md``, ``results.json`` and one chart for each growth.
 
     Args:
         out: Directory; made if missing.
