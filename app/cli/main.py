@@ -19,6 +19,9 @@ from onedemo.app.cli.people import add_people_commands
 from onedemo.core.process import prepare_process
 from onedemo.errors import UserError
 
+_APP_ONLY = ("aiohttp", "krippendorff", "mjviser", "msgspec", "packaging", "pyarrow", "viser")
+"""Packages of the extra ``app``: the library does without, the page and the data set do not."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line and returns the exit code: 0, or 2 for bad input."""
@@ -28,6 +31,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return arguments.run(arguments) or 0
     except UserError as error:
         print(f"onedemo: {error}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in _APP_ONLY:
+            raise
+        print(f"onedemo: {error.name} is not installed: pip install 'onedemo[app]'", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

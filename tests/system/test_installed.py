@@ -1,15 +1,18 @@
 """The built and the installed program: one name in site-packages, beside whatever else somebody has."""
 
+import re
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
 from helpers.paths import ROOT
+from onedemo.app.cli import main
 
 pytestmark = pytest.mark.seam
 
@@ -88,3 +91,25 @@ def test_it_runs_beside_anything_of_the_same_names(kind, wheel, source, tmp_path
     said = "import onedemo, onedemo.app, onedemo.training.learner as l; print(onedemo.__file__, l.__file__)"
     for file in run(python, "-c", said, cwd=home).split():
         assert Path(file).is_relative_to(packages if kind == "wheel" else source)
+
+
+def test_the_library_does_without_the_extra(tmp_path):
+    """Reward and training are imported with none of its packages; the command says what to install."""
+    extra = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["app"]
+    names = sorted(re.match(r"[a-z]+", line)[0] for line in extra)
+    assert tuple(names) == main._APP_ONLY
+    modules = [
+        "onedemo." + ".".join(file.relative_to(ROOT / "trainer").with_suffix("").parts)
+        for file in sorted((ROOT / "trainer").rglob("*.py"))
+        if not file.stem.startswith("__") and "experiments" not in file.parts
+    ]
+    code = f"""
+import importlib, sys
+for name in {names}: sys.modules[name] = None  # as if it were not installed
+for name in {modules}: importlib.import_module(name)
+from onedemo.app.cli.main import main
+sys.exit(main(["demo", "list", "--data-dir", "nowhere"]) or (main(["serve", "--data-dir", "nowhere"]) != 2))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-1500:]
+    assert done.stderr.count("pip install 'onedemo[app]'") == 1 and "Traceback" not in done.stderr
