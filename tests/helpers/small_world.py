@@ -15,7 +15,7 @@ from onedemo.demos.ground_truth import HiddenStates, hidden_path, save_hidden
 from onedemo.demos.video import write_webm
 from onedemo.render.renderer import Renderer
 from onedemo.sim import kinematics, vector_env
-from onedemo.sim.task_rewards import joint_points
+from onedemo.sim.kinematics import joint_points
 from onedemo.types import Demo
 from onedemo.vision.pose_estimator import Track
 

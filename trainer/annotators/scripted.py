@@ -24,7 +24,7 @@ from onedemo.annotators.base import Judge
 from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import CONTACT_MARGIN, clearances
+from onedemo.sim.kinematics import CONTACT_MARGIN, clearances
 from onedemo.types import Demo
 
 SUFFIX = ".script.json"

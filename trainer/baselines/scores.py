@@ -14,10 +14,11 @@ from typing import Any
 import torch
 
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
+from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy
 from onedemo.rl.rollouts import Episodes
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import clean_turns, net_turns, task_reward, until_fall
+from onedemo.sim.task_rewards import task_reward, until_fall
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

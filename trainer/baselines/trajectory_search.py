@@ -24,15 +24,10 @@ from tqdm import tqdm
 
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.errors import UserError
+from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import (
-    backflip_reward,
-    clean_turns,
-    clearances,
-    fallen,
-    joint_points,
-    net_turns,
-)
+from onedemo.sim.kinematics import clearances, fallen, joint_points
+from onedemo.sim.task_rewards import backflip_reward
 
 GRAVITY = 9.81
 STANDING = 1.2

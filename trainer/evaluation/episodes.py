@@ -13,21 +13,13 @@ from typing import Protocol
 import numpy as np
 
 from onedemo.annotators.oracle import Oracle, appearance
+from onedemo.evaluation.metrics import clean_turns, farthest_turn, landings, net_turns, turned
 from onedemo.evaluation.time_warping import align
 from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import (
-    backflip_reward,
-    clean_turns,
-    farthest_turn,
-    hop_reward,
-    landings,
-    net_turns,
-    turned,
-    until_fall,
-)
+from onedemo.sim.task_rewards import backflip_reward, hop_reward, until_fall
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6
@@ -120,9 +112,9 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``state_error``: mean squared error of its states (``state_errors``), mean over time.
         - ``backflip_reward``, with the actions clipped to what the motors do, and
           ``backflip_reward_raw_actions``.
-        - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.sim.task_rewards``.
+        - ``net_turns``, ``clean_turns``, ``landings``: see ``onedemo.evaluation.metrics``.
         - ``turned``, ``farthest_turn``: backward rotation in turns, not rounded; see
-            ``onedemo.sim.task_rewards``.
+            ``onedemo.evaluation.metrics``.
         - ``hop_return``: of stock Hopper-v5, which ends at the first fall.
         - ``hop_reward``: the same rewards over the whole episode, falls or not.
         - ``upright_seconds``: until then.

@@ -12,7 +12,7 @@ import numpy as np
 
 from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, Transitions
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import clearances
+from onedemo.sim.kinematics import clearances
 
 _JOINTS = np.array([[-2.6, 0.05], [-2.6, 0.05], [-0.78, 0.78]])
 """Range of thigh, leg and foot, radians: that of the model's joints (hopper.xml), whose stops are soft."""

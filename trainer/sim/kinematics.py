@@ -1,12 +1,25 @@
-"""The Hopper's body as a picture shows it: height, direction of each part, and how fast both change.
+"""The Hopper's body: joints, contact, and what a picture shows of it: height, directions and their rates.
 
-Shapes: "..." any batch shape, o = 11 observations, P = 9 numbers of a pose: the torso's height, and
+Pure functions on arrays; no simulator runs here. Angles grow when the hopper leans forward.
+
+Shapes: "..." any batch shape, o = 11 observations, q = 6 positions (x, z, angle of the torso, joints of
+thigh, leg and foot), P = 9 numbers of a pose: the torso's height, and
 sine and cosine of the directions of torso, thigh, leg and foot.
 """
 
 from __future__ import annotations
 
 import numpy as np
+
+CONTACT_MARGIN = 0.002
+"""Metres between a part and the ground at which MuJoCo's contact sets in: a part can lie on the
+ground at rest without reaching it. Both geoms have a margin of 0.001 (hopper.xml); MuJoCo 4 adds
+them up."""
+
+# hopper.xml: length of each part along its own axis from joint to joint, metres.
+_HALF_TORSO, _THIGH, _LEG = 0.2, 0.45, 0.5
+_HEEL, _TOE = -0.13, 0.26  # ends of the foot, before and behind the ankle
+_RADII = {"torso": 0.05, "thigh": 0.05, "leg": 0.04, "foot": 0.06}
 
 POSE = 9
 HEIGHT_SCALE = 1.5
@@ -56,3 +69,71 @@ def _summed(joints: np.ndarray) -> np.ndarray:
     return joints[..., :1] - np.concatenate(
         [np.zeros_like(joints[..., :1]), np.cumsum(joints[..., 1:], axis=-1)], axis=-1
     )
+
+
+def fallen(qpos: np.ndarray) -> np.ndarray:
+    """Whether torso, thigh or leg touches the ground.
+
+    Args:
+        qpos: Positions, (..., q).
+
+    Returns:
+        True where one does, (...).
+    """
+    gaps = clearances(qpos)
+    return np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]]) < CONTACT_MARGIN
+
+
+def clearances(qpos: np.ndarray) -> dict[str, np.ndarray]:
+    """Distance of the ground from each part's capsule, negative inside it.
+
+    Args:
+        qpos: Positions, (..., q).
+
+    Returns:
+        Metres, (...), of "torso", "thigh", "leg" and "foot".
+    """
+    z = {name: point[..., 1] for name, point in joint_points(qpos).items()}
+    ends = {
+        "torso": (z["top"], z["hip"]),
+        "thigh": (z["hip"], z["knee"]),
+        "leg": (z["knee"], z["ankle"]),
+        "foot": (z["heel"], z["toe"]),
+    }
+    return {part: np.minimum(a, b) - _RADII[part] for part, (a, b) in ends.items()}
+
+
+def joint_points(qpos: np.ndarray) -> dict[str, np.ndarray]:
+    """Where the hopper's joints and ends are: forward kinematics in the plane.
+
+    Args:
+        qpos: Positions, (..., q).
+
+    Returns:
+        (x, z) in metres, (..., 2), of "top", "hip", "knee", "ankle", "heel" and "toe".
+    """
+    torso = qpos[..., 2]
+    # Joint axes point the other way than the torso's, so joint angles are subtracted.
+    thigh, leg, foot = (torso - qpos[..., 3 : 3 + n].sum(-1) for n in (1, 2, 3))
+    centre = qpos[..., :2]
+    hip = centre - _HALF_TORSO * _up(torso)
+    knee = hip - _THIGH * _up(thigh)
+    ankle = knee - _LEG * _up(leg)
+    return {
+        "top": centre + _HALF_TORSO * _up(torso),
+        "hip": hip,
+        "knee": knee,
+        "ankle": ankle,
+        "heel": ankle + _HEEL * _ahead(foot),
+        "toe": ankle + _TOE * _ahead(foot),
+    }
+
+
+def _up(angle: np.ndarray) -> np.ndarray:
+    """Unit vector (x, z) along a part that points up at angle 0."""
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def _ahead(angle: np.ndarray) -> np.ndarray:
+    """Unit vector (x, z) along a part that points ahead at angle 0."""
+    return np.stack([np.cos(angle), -np.sin(angle)], axis=-1)

@@ -11,18 +11,12 @@ from helpers.paths import DEMOS
 from onedemo.baselines import handcoded_trpo, trajectory_search
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.errors import UserError
+from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import evaluate
 from onedemo.sim import vector_env
-from onedemo.sim.task_rewards import (
-    backflip_reward,
-    clean_turns,
-    clearances,
-    fallen,
-    net_turns,
-    task_reward,
-    until_fall,
-)
+from onedemo.sim.kinematics import clearances, fallen
+from onedemo.sim.task_rewards import backflip_reward, task_reward, until_fall
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ from onedemo.app.cli.main import main
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
+from onedemo.evaluation.metrics import farthest_turn, net_turns, turned
 from onedemo.experiments.jobs import person
 from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.report import document
@@ -16,7 +17,6 @@ from onedemo.experiments.runner import Job, Outcome
 from onedemo.experiments.tables import person as person_table
 from onedemo.experiments.tables import transfer
 from onedemo.experiments.tables.transfer import BACK, THERE
-from onedemo.sim.task_rewards import farthest_turn, net_turns, turned
 from unit.experiments.test_tables import run
 
 SEED = 101  # not one of those that are reported

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from onedemo.rl.random_states import HeldNoise, RandomStarts, random_states, wild_rollouts
-from onedemo.sim.task_rewards import clearances
+from onedemo.sim.kinematics import clearances
 
 RANGES = np.radians([[-150, 0], [-150, 0], [-45, 45]])  # of thigh, leg and foot, hopper.xml
 

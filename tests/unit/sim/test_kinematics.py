@@ -7,7 +7,7 @@ import pytest
 from onedemo.annotators.oracle import appearance
 from onedemo.rl.random_states import random_states, wild_rollouts
 from onedemo.sim import kinematics, vector_env
-from onedemo.sim.task_rewards import clearances
+from onedemo.sim.kinematics import clearances
 
 HOPPER = vector_env.spec("hopper")
 

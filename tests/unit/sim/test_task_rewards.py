@@ -6,20 +6,21 @@ import pytest
 
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.demos.library import BUILT_IN
-from onedemo.sim import task_rewards, vector_env
+from onedemo.evaluation import metrics
+from onedemo.sim import kinematics, task_rewards, vector_env
 
 DT = 0.008
 
 
 def test_net_turns():
     two_and_a_half = np.linspace(0, -5 * np.pi, 200)
-    assert task_rewards.net_turns(two_and_a_half) == 2
-    assert task_rewards.net_turns(-two_and_a_half) == -2
-    assert task_rewards.net_turns(np.array([0.0, 0.1])) == 0, "a slight forward lean is no turn"
+    assert metrics.net_turns(two_and_a_half) == 2
+    assert metrics.net_turns(-two_and_a_half) == -2
+    assert metrics.net_turns(np.array([0.0, 0.1])) == 0, "a slight forward lean is no turn"
     wrapped = np.angle(np.exp(1j * two_and_a_half))
-    assert task_rewards.net_turns(wrapped) == 2
+    assert metrics.net_turns(wrapped) == 2
     there_and_back = np.concatenate([two_and_a_half, two_and_a_half[::-1]])
-    np.testing.assert_array_equal(task_rewards.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0])
+    np.testing.assert_array_equal(metrics.net_turns(np.stack([there_and_back, np.zeros(400)])), [0, 0])
 
 
 def path(angles, heights):
@@ -34,20 +35,20 @@ def test_clean_turns_count_only_what_the_foot_carries():
     high, low = np.full(100, 3.0), np.full(100, 0.3)
     flying = path(turn, high)
     rolling = path(turn, low)
-    assert task_rewards.clean_turns(flying) == 1
-    assert task_rewards.clean_turns(rolling) == 0
+    assert metrics.clean_turns(flying) == 1
+    assert metrics.clean_turns(rolling) == 0
     # One clean turn, one on the ground, one clean: two, though three turns were made.
     mixed = np.concatenate([flying, rolling, flying])
     mixed[100:, 2] += turn[-1]
     mixed[200:, 2] += turn[-1]
-    assert task_rewards.net_turns(mixed[:, 2]) == 3
-    assert task_rewards.clean_turns(mixed) == 2
+    assert metrics.net_turns(mixed[:, 2]) == 3
+    assert metrics.clean_turns(mixed) == 2
     # A touch half-way through a turn leaves two halves: nothing.
     touch = flying.copy()
     touch[50, 1] = 0.2  # upside down: the head
-    assert task_rewards.clean_turns(touch) == 0
-    np.testing.assert_array_equal(task_rewards.clean_turns(np.stack([flying, rolling])), [1, 0])
-    assert task_rewards.clean_turns(path(-turn, high)) == -1
+    assert metrics.clean_turns(touch) == 0
+    np.testing.assert_array_equal(metrics.clean_turns(np.stack([flying, rolling])), [1, 0])
+    assert metrics.clean_turns(path(-turn, high)) == -1
 
 
 def demo_positions(name):
@@ -58,31 +59,31 @@ def test_landings_of_the_demos():
     """The clean demo lands its three flips; the tumbling one never stands, the hop never turns."""
     clean, tumbling, hop = map(demo_positions, ("hopper-flip-clean", "hopper-backflip", "hopper-hop"))
     lanes = np.stack([clean, tumbling, hop])
-    np.testing.assert_array_equal(task_rewards.landings(lanes, DT), [3, 0, 0])
-    np.testing.assert_array_equal(task_rewards.net_turns(lanes[..., 2]), [3, 9, 0])
+    np.testing.assert_array_equal(metrics.landings(lanes, DT), [3, 0, 0])
+    np.testing.assert_array_equal(metrics.net_turns(lanes[..., 2]), [3, 9, 0])
 
 
 def test_a_landing_is_on_the_foot_upright_and_lasts():
     clean = demo_positions("hopper-flip-clean")
     first = 300  # stands after its first flip
-    assert task_rewards.landings(clean[:first], DT) == 1
-    over = int((clean[:, 2] <= task_rewards.LANDED_LEAN - 2 * np.pi).argmax())
-    stay = round(task_rewards.LANDED_FOR_S / DT)
-    assert task_rewards.landings(clean[: over + stay - 1], DT) == 0, "too short to tell"
+    assert metrics.landings(clean[:first], DT) == 1
+    over = int((clean[:, 2] <= metrics.LANDED_LEAN - 2 * np.pi).argmax())
+    stay = round(metrics.LANDED_FOR_S / DT)
+    assert metrics.landings(clean[: over + stay - 1], DT) == 0, "too short to tell"
     floating = clean[:first].copy()
     floating[over:, 1] += 0.5
-    assert task_rewards.landings(floating, DT) == 0, "the foot never touches the ground"
+    assert metrics.landings(floating, DT) == 0, "the foot never touches the ground"
     lying = clean[:first].copy()
     lying[over:, 1] = 0.2
-    assert task_rewards.landings(lying, DT) == 0
+    assert metrics.landings(lying, DT) == 0
     leaning = clean[:first].copy()
     leaning[over:, 2] -= 1.0
-    assert task_rewards.landings(leaning, DT) == 0
+    assert metrics.landings(leaning, DT) == 0
     late = np.concatenate([clean[:over], np.repeat(floating[over : over + 1], 100, 0), clean[over:first]])
-    assert task_rewards.landings(late, DT) == 0, "0.8 s in the air after the turn is over"
+    assert metrics.landings(late, DT) == 0, "0.8 s in the air after the turn is over"
     shift = clean[:first].copy()
     shift[:, 2] = np.angle(np.exp(1j * shift[:, 2]))
-    assert task_rewards.landings(shift, DT) == 1, "wrapped angles"
+    assert metrics.landings(shift, DT) == 1, "wrapped angles"
 
 
 def random_qpos(count, seed):
@@ -98,13 +99,13 @@ def test_geometry_is_the_models():
     contacts = 0
     poses = random_qpos(300, 0)
     # The last ones rest within the contact margin: a part lies on the ground before it reaches it.
-    gaps = task_rewards.clearances(poses[250:])
+    gaps = kinematics.clearances(poses[250:])
     lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
     poses[250:, 1] += np.linspace(0.0001, 0.004, 50) - lowest
     for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        points, gaps = task_rewards.joint_points(qpos), task_rewards.clearances(qpos)
+        points, gaps = kinematics.joint_points(qpos), kinematics.clearances(qpos)
         for joint, point in (("thigh", "hip"), ("leg", "knee"), ("foot", "ankle")):
             np.testing.assert_allclose(
                 data.joint(f"{joint}_joint").xanchor[[0, 2]], points[point], atol=1e-12
@@ -117,7 +118,7 @@ def test_geometry_is_the_models():
         ids = [model.geom(f"{part}_geom").id for part in ("torso", "thigh", "leg")]
         pairs = [set(pair) for pair in data.contact.geom]
         touching = any({floor, i} in pairs for i in ids)
-        assert task_rewards.fallen(qpos) == touching
+        assert kinematics.fallen(qpos) == touching
         contacts += touching
     assert 50 < contacts < 270
 
