@@ -20,7 +20,7 @@ from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos.library import list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
-from onedemo.reward.warm_start import snapshot_file
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_version
 from onedemo.storage.store import FILE_NAME
 from onedemo.vision.encoders import make_encoder
@@ -173,9 +173,15 @@ def _files(data_dir: Path) -> Iterator[Finding]:
             "SELECT run, id FROM clips WHERE state = 'ready' AND id NOT IN (SELECT clip_id FROM events)"
         ).fetchall()
     root = data_dir / "runs"
-    named = {snapshot_file(root / run, number) for run, number in snapshots}
+    for run in runs:
+        try:
+            RunDirectory(data_dir, run)
+        except UserError as error:  # a database of somebody else's: no path is made of it
+            yield Finding("files", False, f"the database names a run that cannot be a directory: {error}")
+            return
+    named = {RunDirectory(data_dir, run).snapshot(number) for run, number in snapshots}
     there = set(root.glob("*/snapshots/*.pt"))
-    clips = {root / run / "clips" / f"{clip:06d}.jpg" for run, clip in waiting}
+    clips = {RunDirectory(data_dir, run).clip(clip) for run, clip in waiting}
     pictures = set(root.glob("*/clips/*.jpg"))
     kept = [*there, *root.glob("*/checkpoint*.pt"), *root.glob("*/rollouts/*.npz")]
     orphans = [path for path in root.glob("*") if path.is_dir() and path.name not in runs]

@@ -13,6 +13,7 @@ from onedemo.app.dataset.parquet import read_about, read_segments
 from onedemo.core.files import write_atomic
 from onedemo.core.names import LONGEST, check_name
 from onedemo.errors import UserError
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
@@ -59,7 +60,7 @@ def import_data(ratings: Path, segments: Path, data_dir: Path) -> dict[str, int]
             for run, rater in sorted({(row["run"], row["rater"]) for row in rows if row["left_out"]}):
                 store.leave_out(run, raters[rater], by=raters[rater])
         for run in runs:
-            write_atomic(data_dir / "runs" / run["id"] / "config.toml", run["config"].encode())
+            write_atomic(RunDirectory(data_dir, run["id"]).config, run["config"].encode())
     finally:
         store.close()
     return {"runs": len(runs), "clips": len(clips), "ratings": len(rows)}

@@ -16,6 +16,7 @@ from onedemo.errors import UserError
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.model import Snapshot, check_start
 from onedemo.reward.warm_start import newest_snapshot
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
 from onedemo.training.trainer import Trainer
@@ -61,10 +62,10 @@ class Study:
             UserError: If another process works on it, or its encoder cannot be had.
         """
         encoder = make_encoder(config.encoder, self._encoder_weights)
-        directory = self._data_dir / "runs" / run
+        files = RunDirectory(self._data_dir, run)
         held = ExitStack()
-        held.enter_context(hold(directory / "lock"))
-        held.enter_context(_log_to(directory / "log"))
+        held.enter_context(hold(files.lock))
+        held.enter_context(_log_to(files.log))
         trainer = Trainer(
             store=self._store, data_dir=self._data_dir, run=run, demo=demo,
             config=replace(config, device=self._device), encoder=encoder, renderer=self._renderer,

@@ -35,7 +35,16 @@ def test_a_killed_training_ends_as_one_that_was_left_alone(tmp_path, method, mom
     (tmp_path / "demo.json").write_text(json.dumps(demo, default=str))
 
     def training(name, moment):
-        command = [sys.executable, DYING, str(tmp_path / name), method, RATER, moment]
+        command = [
+            "env",
+            f"PYTHONPATH={TESTS}",
+            sys.executable,
+            DYING,
+            str(tmp_path / name),
+            method,
+            RATER,
+            moment,
+        ]
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
     with training("whole", "") as whole:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
-
-_KEPT = "start.pt"
 
 
 def newest_snapshot(store: Store, data_dir: Path, run: str) -> Path:
@@ -33,22 +32,17 @@ def newest_snapshot(store: Store, data_dir: Path, run: str) -> Path:
     if not rows:
         raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
     for row in reversed(rows):
-        file = snapshot_file(data_dir / "runs" / run, row["number"])
+        file = RunDirectory(data_dir, run).snapshot(row["number"])
         if file.exists() and not archive_fault(file.read_bytes()):
             return file
     raise UserError(f"run {run!r} has no similarity predictor left: its files are missing or damaged")
 
 
-def snapshot_file(directory: Path, number: int) -> Path:
-    """Where a run's directory holds a snapshot."""
-    return directory / "snapshots" / f"{number:06d}.pt"
-
-
-def keep_start(directory: Path, given: Path | None, *, begun: bool) -> Path | None:
+def keep_start(files: RunDirectory, given: Path | None, *, begun: bool) -> Path | None:
     """Copies what a run starts from into its directory.
 
     Args:
-        directory: Of the run.
+        files: Of the run.
         given: A snapshot's file, or None: what was kept before.
         begun: Whether the run has a predictor of its own already.
 
@@ -58,7 +52,7 @@ def keep_start(directory: Path, given: Path | None, *, begun: bool) -> Path | No
     Raises:
         UserError: If the file cannot be read, or the run began with another start or without one.
     """
-    kept = directory / _KEPT
+    kept = files.start
     if given is None:
         return kept if kept.exists() else None
     try:
@@ -68,10 +62,10 @@ def keep_start(directory: Path, given: Path | None, *, begun: bool) -> Path | No
     if kept.exists():
         if kept.read_bytes() != start:
             raise UserError(
-                f"run {directory.name!r} started from another predictor ({kept}); name none to go on with it"
+                f"run {files.run!r} started from another predictor ({kept}); name none to go on with it"
             )
     elif begun:
-        raise UserError(f"run {directory.name!r} has begun without a predictor to start from")
+        raise UserError(f"run {files.run!r} has begun without a predictor to start from")
     else:
         write_atomic(kept, start)
     return kept

@@ -36,16 +36,22 @@ class Pairing:
     Args:
         store: Holds them.
         run: Name of the run.
-        directory: Takes their pictures.
+        file: Where the picture of a pair goes.
         frames: The demo's frames, (F, H, W, 3), uint8.
         renderer: Draws; not closed here.
         seed: Of what is drawn by lot.
     """
 
     def __init__(
-        self, store: Store, run: str, directory: Path, frames: np.ndarray, renderer: RenderThread, seed: int
+        self,
+        store: Store,
+        run: str,
+        file: Callable[[int], Path],
+        frames: np.ndarray,
+        renderer: RenderThread,
+        seed: int,
     ) -> None:
-        self._store, self._run, self._directory = store, run, directory
+        self._store, self._run, self._file = store, run, file
         self._frames, self._renderer = frames, renderer
         self._rng = np.random.default_rng([seed, 1207])
         self._wanted_until = 0.0
@@ -55,20 +61,16 @@ class Pairing:
         """Somebody looks; any thread may say so."""
         self._wanted_until = time.monotonic() + _WANTED_S
 
-    def file(self, pair_id: int) -> Path:
-        """The picture of a pair: demo, left, right; it is there once the pair is "ready"."""
-        return self._directory / f"{pair_id:06d}.jpg"
-
     def fill(self, learner: Learner, pool: Rollouts | None) -> None:
         """Cuts what is missing from the queue, if somebody looks, and has it drawn."""
         if pool is None or time.monotonic() > self._wanted_until:
             return
         ready = self._store.waiting_pairs(self._run)
         oldest = learner.iteration - _OLD
-        stale = [p.id for p in ready if p.iteration < oldest or not self.file(p.id).exists()]
+        stale = [p.id for p in ready if p.iteration < oldest or not self._file(p.id).exists()]
         if not self._begun:  # a process before this one was to draw them, or has drawn them
             stale += [p.id for p in self._store.waiting_pairs(self._run, "cut")]
-            stale += [p.id for p in ready if not read_whole(self.file(p.id), jpeg_fault)]
+            stale += [p.id for p in ready if not read_whole(self._file(p.id), jpeg_fault)]
             self._begun = True
         self._store.set_pair_state(stale, "withdrawn")
         waiting = [p for state in ("ready", "cut") for p in self._store.waiting_pairs(self._run, state)]
@@ -97,7 +99,7 @@ class Pairing:
             left, right = self._store.pair_segments(pair.id)
             index, first = np.unique(frames_of(pair.demo_step + np.arange(pair.steps)), return_index=True)
             robots = [renderer.render(segment.qpos[first]) for segment in (left, right)]
-            write_atomic(self.file(pair.id), sealed(compose_clip(self._frames[index], *robots)))
+            write_atomic(self._file(pair.id), sealed(compose_clip(self._frames[index], *robots)))
             self._store.set_pair_state([pair.id], "ready")
         except Exception:
             log.exception("pair %d could not be drawn", pair.id)

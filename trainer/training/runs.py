@@ -13,6 +13,7 @@ from onedemo.config import RunConfig, load_config, to_toml
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_name
 from onedemo.errors import UserError
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.learner import lengths
 from onedemo.types import Demo
@@ -47,7 +48,7 @@ def find_run(
             f"run {run['id']!r} was made with another video than demo {demo.name!r} is now; "
             "start a new run with --new-run"
         )
-    file = data_dir / "runs" / run["id"] / "config.toml"
+    file = RunDirectory(data_dir, run["id"]).config
     if not file.exists():  # lost with the directory; the database has it too
         write_atomic(file, run["config"].encode())
     config = load_config(file, _of_before(file))
@@ -120,5 +121,5 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         config=text,
         version=program_version(),
     )
-    write_atomic(data_dir / "runs" / name / "config.toml", text.encode())
+    write_atomic(RunDirectory(data_dir, name).config, text.encode())
     return name

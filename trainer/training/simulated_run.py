@@ -74,7 +74,7 @@ def train(
         cache_dir=cache_dir, watch=watch, start=start,
     )  # fmt: skip
     try:
-        with hold(trainer.directory / "lock"):
+        with hold(trainer.files.lock):
             failure = _work(trainer, config.rollouts.total_steps, progress)
     finally:
         simulated.close()

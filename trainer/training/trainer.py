@@ -27,11 +27,12 @@ from onedemo.errors import in_words
 from onedemo.render.renderer import RenderThread
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
-from onedemo.reward.warm_start import keep_start, snapshot_file
+from onedemo.reward.warm_start import keep_start
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training import best_rollouts
 from onedemo.training.checkpoint import load_checkpoint, save_checkpoint
@@ -97,7 +98,8 @@ class Trainer:
         self.data_dir = data_dir
         self.cache_dir = cache_dir or data_dir
         self._watch, self._start = watch, start
-        self.directory = data_dir / "runs" / run
+        self.files = RunDirectory(data_dir, run)
+        self.directory = self.files.path
         self._encoder, self._renderer, self._simulated = encoder, renderer, simulated
         self._learner: Learner | None = None
         self._snapshot: Snapshot | None = None
@@ -105,7 +107,7 @@ class Trainer:
         self._pairing: Pairing | None = None
         self._gallery = None
         if renderer is not None:
-            self._gallery = best_rollouts.Gallery(self.directory / "rollouts", demo, self.dt, renderer)
+            self._gallery = best_rollouts.Gallery(self.files.rollouts, demo, self.dt, renderer)
         self._asking = Asking(store, run, config, simulated)
         self._training_set = TrainingSet(store, run, self.dt)
         self._pool: Rollouts | None = None
@@ -181,7 +183,7 @@ class Trainer:
 
     def clip_file(self, clip_id: int) -> Path:
         """The picture of a clip, all its frames; it is there once the clip is "ready"."""
-        return self.directory / "clips" / f"{clip_id:06d}.jpg"
+        return self.files.clip(clip_id)
 
     def want_pairs(self) -> None:
         """Somebody would compare pairs: some are made while this is said every few seconds."""
@@ -190,7 +192,7 @@ class Trainer:
 
     def pair_file(self, pair_id: int) -> Path:
         """The picture of a pair; it is there once the pair is "ready"."""
-        return self.directory / "pairs" / f"{pair_id:06d}.jpg"
+        return self.files.pair(pair_id)
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         """The best rollout of an iteration, as ``Gallery.file``.
@@ -271,7 +273,7 @@ class Trainer:
         # they compute, the longer the busier the machine. Their first weights depend on the number, too.
         torch.set_num_threads(1)
         begun = bool(self.store.snapshots(self.run))
-        start = keep_start(self.directory, self._start, begun=begun)
+        start = keep_start(self.files, self._start, begun=begun)
         first = Snapshot.load(start, self.config.device) if start is not None else None
         learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
         if not self._load_checkpoint(learner):
@@ -285,7 +287,7 @@ class Trainer:
                 renderer=self._renderer,
             )  # fmt: skip
             self._pairing = Pairing(
-                self.store, self.run, self.directory / "pairs", frames, self._renderer, self.config.seed
+                self.store, self.run, self.files.pair, frames, self._renderer, self.config.seed
             )
             self._asking.clips.recover(self.run)
         with ThreadPoolExecutor(1, "look") as beside:
@@ -340,7 +342,7 @@ class Trainer:
         self._pool, self._policy = rollouts, learner.policy()
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
         left = self._asking.given() < self._asking.target
-        save_checkpoint(self._checkpoint, learner.state_dict(), row, rollouts if left else None)
+        save_checkpoint(self.files.checkpoint, learner.state_dict(), row, rollouts if left else None)
         self.store.add_iteration(self.run, learner.iteration, **row)
         self._asking.withdraw_stale(learner.iteration)
         if self._watch is not None:
@@ -357,7 +359,7 @@ class Trainer:
             return False
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
-        snapshot.save(snapshot_file(self.directory, number))
+        snapshot.save(self.files.snapshot(number))
         self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
         self._snapshot, self._fitted_event = snapshot, event
         self._asking.predict_waiting(learner, snapshot)
@@ -418,18 +420,14 @@ class Trainer:
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds whole."""
         for row in reversed(self.store.snapshots(self.run)):
-            file = snapshot_file(self.directory, row["number"])
+            file = self.files.snapshot(row["number"])
             if read_whole(file) is not None:
                 self._snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]
                 return
 
-    @property
-    def _checkpoint(self) -> Path:
-        return self.directory / "checkpoint.pt"
-
     def _load_checkpoint(self, learner: Learner) -> bool:
-        saved = load_checkpoint(self._checkpoint)
+        saved = load_checkpoint(self.files.checkpoint)
         if saved is None:
             return False
         state, row, self._pool = saved

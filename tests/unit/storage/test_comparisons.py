@@ -18,6 +18,7 @@ from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
+from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.comparison_queue import Pairing, draw_pairs
 from onedemo.training.learner import Learner
@@ -168,7 +169,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
     demo = falling_demo(tmp_path / "demo")
     learner = Learner(small_config(), demo.frames, demo.fps)
     with RenderThread() as drawing:
-        pairing = Pairing(store, "r", tmp_path / "pairs", read_frames(demo), drawing, seed=0)
+        pairing = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
         pairing.fill(learner, learner.random_rollouts())
         assert store.waiting_pairs("r", "cut") == []  # nobody looks
         pairing.want()
@@ -177,7 +178,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         drawing.submit(lambda renderer: None).result()
         ready = store.waiting_pairs("r")
         assert len(ready) == 6
-        picture = cv2.imread(str(pairing.file(ready[0].id)))
+        picture = cv2.imread(str(RunDirectory(tmp_path, "r").pair(ready[0].id)))
         assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
         robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
         assert np.abs(robots[0] - robots[1]).max() > 60
@@ -194,20 +195,20 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         # A process that died: one pair answered, one without its picture, one with a damaged one, one that
         # was still to be drawn.
         answered, lost, damaged, *rest = (pair.id for pair in ready)
-        content = bytearray(pairing.file(damaged).read_bytes())
+        content = bytearray(RunDirectory(tmp_path, "r").pair(damaged).read_bytes())
         content[len(content) // 2] ^= 1
-        pairing.file(damaged).write_bytes(content)
+        RunDirectory(tmp_path, "r").pair(damaged).write_bytes(content)
         store.compare(answered, store.ensure_rater("Ann", "annotator").id, "left", 900)
-        pairing.file(lost).unlink()
+        RunDirectory(tmp_path, "r").pair(lost).unlink()
         new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
         undrawn = store.add_pairs("r", [new])[0].id
-        after = Pairing(store, "r", tmp_path / "pairs", read_frames(demo), drawing, seed=0)
+        after = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
         after.want()
         after.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
         waiting = [pair.id for pair in store.waiting_pairs("r")]
         assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
-        assert all(pairing.file(pair).exists() for pair in waiting)
+        assert all(RunDirectory(tmp_path, "r").pair(pair).exists() for pair in waiting)
         assert store.waiting_pairs("r", "cut") == [] and store.count_comparisons("r") == 1
 
 
