@@ -50,7 +50,12 @@ def die() -> None:
 def arm(moment: str) -> None:
     """Sees to it that this process dies at that moment."""
     owner, name, call, after = MOMENTS[moment]
-    where = {"store": Store, "snapshot": Snapshot, "os": files.os, "learner": onedemo.learner.Learner}[owner]
+    where = {
+        "store": Store,
+        "snapshot": Snapshot,
+        "os": files.os,
+        "learner": onedemo.training.learner.Learner,
+    }[owner]
     whole, calls = getattr(where, name), 0
 
     def dying(*args, **kwargs):
@@ -68,7 +73,7 @@ def arm(moment: str) -> None:
 
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
-    onedemo.learner._WILD_LANES, onedemo.practice._BANK_TRIES = 4, 200
+    onedemo.training.learner._WILD_LANES, onedemo.reward.episode_rules._BANK_TRIES = 4, 200
     config = small_world.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))
