@@ -57,15 +57,14 @@ def _outputs(parser: argparse.ArgumentParser, *, quick: str) -> None:
 
 
 def _speed(arguments: argparse.Namespace) -> int:
-    from onedemo.experiments.speed import parts as speed
-    from onedemo.experiments.speed import report
+    from onedemo.experiments.speed import parts, report
 
-    unknown = {part for part in arguments.parts or () if "." not in part} - set(speed.PARTS)
+    unknown = {part for part in arguments.parts or () if "." not in part} - set(parts.PARTS)
     if unknown:
-        raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(speed.PARTS)}")
+        raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(parts.PARTS)}")
     _check_outputs(arguments)
     began = time.monotonic()
-    results = speed.measure(quick=arguments.quick, parts=arguments.parts or speed.PARTS, tell=_tell)
+    results = parts.measure(quick=arguments.quick, parts=arguments.parts or parts.PARTS, tell=_tell)
     about = report.as_json(results, command=_command_line(), seconds=time.monotonic() - began)
     print(report.table(results))
     if arguments.out is not None:

@@ -11,9 +11,9 @@ from typing import Any
 from onedemo.app.dataset.columns import RATINGS
 from onedemo.app.dataset.parquet import read_about, read_segments
 from onedemo.core.files import write_atomic
-from onedemo.core.names import LONGEST, check_name
+from onedemo.core.names import LONGEST
 from onedemo.errors import UserError
-from onedemo.storage.run_directory import RunDirectory
+from onedemo.storage.run_directory import RunDirectory, check_run_name
 from onedemo.storage.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
@@ -108,4 +108,4 @@ def _check_run(run: Any, file: Path) -> None:
         isinstance(run.get(n), int if n == "seed" else str) for n in _RUN
     ):
         raise UserError(f"{file} does not say what its runs are")
-    check_name(run["id"])
+    check_run_name(run["id"])

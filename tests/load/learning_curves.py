@@ -1,6 +1,6 @@
 """Learning curves of two programs, or of two versions of one, in one chart.
 
-Each run is a JSON file of ``python -m onedemo.baselines.handcoded_trpo --evaluate-every 4 --seed N --out
+Each run is a JSON file of ``python -m onedemo.baselines handcoded_trpo --evaluate-every 4 --seed N --out
 PREFIX``. ``python tests/load/learning_curves.py before "before/*.json" after "after/*.json" --out curves``
 writes
 ``curves.svg`` and ``curves.json`` and prints the mean and the deviation over the seeds at each evaluation.

@@ -1,6 +1,6 @@
 """The paper's first baseline: TRPO on a hand-coded reward. It also makes two of the demos.
 
-``python -m onedemo.baselines.handcoded_trpo --task backflip --steps 3000000 --seed 2 --out PREFIX``
+``python -m onedemo.baselines handcoded_trpo --task backflip --steps 3000000 --seed 2 --out PREFIX``
 writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
 ``PREFIX.json`` (settings and the learning curve).
 """
@@ -168,7 +168,9 @@ def save_result(prefix: Path, result: HandcodedResult) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line; ``--help`` lists the options."""
-    parser = argparse.ArgumentParser(description="TRPO on a hand-coded reward.")
+    parser = argparse.ArgumentParser(
+        prog="python -m onedemo.baselines handcoded_trpo", description="TRPO on a hand-coded reward."
+    )
     parser.add_argument("--task", choices=sorted(TASK_REWARDS), default="backflip")
     parser.add_argument("--steps", type=int, default=3_000_000, help="control steps")
     parser.add_argument("--seed", type=int, default=0)
@@ -187,7 +189,3 @@ def main(argv: list[str] | None = None) -> None:
     result = train_handcoded(config)
     save_result(args.out, result)
     print(json.dumps(asdict(result.best_score)))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Renders the built-in demos again.
 
-``python -m onedemo.baselines.make_demo hopper-hop --task hop --source "..."``
+``python -m onedemo.baselines make_demo hopper-hop --task hop --source "..."``
 
 This is the maker of a simulated demo, so it may look at the states behind it; nothing that learns
 imports this module.
@@ -17,7 +17,7 @@ from onedemo.demos.library import BUILT_IN, render_demo, show
 
 def main(arguments: list[str] | None = None) -> None:
     """Reads ``<out>/<name>.hidden.npz``, writes the video and its description beside it."""
-    parser = argparse.ArgumentParser(prog="python -m onedemo.baselines.make_demo", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m onedemo.baselines make_demo", description=main.__doc__)
     parser.add_argument("name", help="the demo's name")
     parser.add_argument("--task", required=True, help="the hand-coded reward that describes it")
     parser.add_argument("--source", required=True, help="what made the motion")
@@ -26,7 +26,3 @@ def main(arguments: list[str] | None = None) -> None:
     qpos = load_hidden(asked.out / f"{asked.name}{SUFFIX}").qpos
     demo = render_demo(qpos, name=asked.name, task=asked.task, source=asked.source, out_dir=asked.out)
     print(show(demo))
-
-
-if __name__ == "__main__":
-    main()

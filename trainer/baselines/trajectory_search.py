@@ -1,6 +1,6 @@
 """Standing backflips with landings, by trajectory optimisation. It makes one of the demos.
 
-``python -m onedemo.baselines.trajectory_search --flips 3 --seed 0 --out PREFIX`` writes
+``python -m onedemo.baselines trajectory_search --flips 3 --seed 0 --out PREFIX`` writes
 ``PREFIX.hidden.npz``. Nothing is learned: at every moment the cross-entropy method (Rubinstein
 1999) searches the next second of motor commands for those that best keep a timetable of leaps, and
 the first part of the best plan is carried out. Touching the ground with anything but the foot
@@ -265,7 +265,10 @@ def _simulate(
 def main(argv: list[str] | None = None) -> None:
     """Command line; ``--help`` lists the options."""
     defaults = FlipPlan()
-    parser = argparse.ArgumentParser(description="Clean standing backflips by optimisation.")
+    parser = argparse.ArgumentParser(
+        prog="python -m onedemo.baselines trajectory_search",
+        description="Clean standing backflips by optimisation.",
+    )
     parser.add_argument("--flips", type=int, default=defaults.flips)
     parser.add_argument("--period", type=float, default=defaults.period, help="seconds")
     parser.add_argument("--start", type=float, default=defaults.start, help="seconds")
@@ -287,7 +290,3 @@ def main(argv: list[str] | None = None) -> None:
         "x": float(hidden.qpos[-1, 0]),
     }
     print(json.dumps(report))
-
-
-if __name__ == "__main__":
-    main()

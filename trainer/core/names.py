@@ -7,16 +7,16 @@ import unicodedata
 
 from onedemo.errors import UserError
 
-_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+LONGEST = 64
+_NAME = re.compile(r"[A-Za-z0-9_-]+")
 _IN_PEOPLE = frozenset(" -_.'@,()+&#")
 """Characters in a person's name besides letters and digits."""
-LONGEST = 64
 
 
-def check_name(name: str) -> None:
-    """Raises UserError unless the name is safe as a file name and in a link."""
-    if not _NAME.fullmatch(name):
-        raise UserError(f"a name is 1 to {LONGEST} letters, digits, '-' or '_', got {_shown(name)}")
+def check_name(name: str, *, longest: int = LONGEST) -> None:
+    """Raises UserError unless the name is safe as a file name and in a link, and no longer than that."""
+    if not (_NAME.fullmatch(name) and len(name) <= longest):
+        raise UserError(f"a name is 1 to {longest} letters, digits, '-' or '_', got {_shown(name)}")
 
 
 def check_person(name: str) -> str:

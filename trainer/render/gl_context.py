@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import sys
 from typing import Any
@@ -23,20 +24,21 @@ def open_context(width: int, height: int) -> Any:
     Raises:
         UserError: If no GL library or no driver is installed, naming the Debian packages.
     """
+    on_linux = sys.platform == "linux"
+    if on_linux and not libegl_loads():
+        raise UserError(
+            "cannot draw the robot: the library libEGL.so.1 is not installed; "
+            "on Debian or Ubuntu run: apt-get install libegl1 libgl1-mesa-dri, then start onedemo again"
+        )
     if os.environ.get("MUJOCO_GL", "").lower() in GL_OFF:
-        if sys.platform == "linux" and not libegl_loads():
-            raise UserError(
-                "cannot draw the robot: the library libEGL.so.1 is not installed; "
-                "on Debian or Ubuntu run: apt-get install libegl1 libgl1-mesa-dri, then start onedemo again"
-            )
         raise UserError(
             f"cannot draw the robot: MUJOCO_GL={os.environ['MUJOCO_GL']} turns pictures off; "
             "unset it, or set MUJOCO_GL=egl"
         )
-    import mujoco
-
     try:
-        context = mujoco.GLContext(width, height)
+        # On Linux EGL by name: MuJoCo's own choice would want a screen in a process that set nothing.
+        GLContext = importlib.import_module("mujoco.egl" if on_linux else "mujoco").GLContext
+        context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # ImportError, RuntimeError or the window library's own, by backend
         raise UserError(

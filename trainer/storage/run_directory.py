@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from onedemo.core.names import check_name
+from onedemo.core.names import LONGEST, check_name
+
+_LONGEST = LONGEST + 20
+"""Characters: a run without a name of its own is called after its demo, with a number behind."""
+
+
+def check_run_name(name: str) -> None:
+    """Raises UserError unless a run may be called so: it becomes the name of a directory."""
+    check_name(name, longest=_LONGEST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +31,7 @@ class RunDirectory:
     run: str
 
     def __post_init__(self) -> None:
-        check_name(self.run)
+        check_run_name(self.run)
 
     @property
     def path(self) -> Path:

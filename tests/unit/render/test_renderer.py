@@ -297,3 +297,22 @@ def test_without_the_egl_library_physics_still_works_and_one_sentence_names_it(t
 def test_pictures_turned_off_by_the_user_say_so():
     lines = draw_elsewhere(MUJOCO_GL="disable")
     assert len(lines) == 2 and "MUJOCO_GL=disable turns pictures off" in lines[0]
+
+
+@pytest.mark.seam
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is how Linux draws without a screen")
+@pytest.mark.parametrize("gl", [None, "glfw", "egl"])
+def test_a_program_that_imports_onedemo_draws_whatever_it_has_set(gl):
+    """It has not called ``prepare_process``: it is somebody else's."""
+    code = (
+        "import numpy as np\nfrom onedemo.render.renderer import Renderer\n"
+        "print(Renderer(64, 48).render(np.array([[0, 1.25, 0, 0, 0, 0.0]])).std() > 5)"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        env=environment | ({"MUJOCO_GL": gl} if gl else {}),
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == "True\n", done.stderr[-1500:]

@@ -10,7 +10,7 @@ from onedemo.errors import UserError
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 
-HOSTILE = ("../../../home/x/.cargo", "..", "", "a/b", "/etc", "a\\b", "nul\0", "x" * 65)
+HOSTILE = ("../../../home/x/.cargo", "..", "", "a/b", "/etc", "a\\b", "nul\0", "x" * 85)
 
 
 def test_where_files_lie(tmp_path):
@@ -26,7 +26,7 @@ def test_where_files_lie(tmp_path):
 
 @pytest.mark.parametrize("name", HOSTILE)
 def test_no_path_is_made_of_a_name_that_leads_elsewhere(tmp_path, name):
-    with pytest.raises(UserError, match="a name is 1 to 64 letters"):
+    with pytest.raises(UserError, match="a name is 1 to 84 letters"):
         RunDirectory(tmp_path, name)
 
 

@@ -27,6 +27,13 @@ def test_new_runs_are_numbered(store, tmp_path):
     assert (tmp_path / "runs" / "flip-2" / "config.toml").exists()
 
 
+def test_a_demo_with_the_longest_name_has_runs(store, tmp_path):
+    demo = replace(DEMO, name="x" * 64)
+    assert add_run(store, tmp_path, demo, load_config(), name=None) == "x" * 64 + "-1"
+    found = find_run(store, tmp_path, demo, name=None, wanted=None)
+    assert found is not None and found[0] == "x" * 64 + "-1"
+
+
 def test_the_newest_run_of_the_demo_goes_on_with_its_own_settings(store, tmp_path):
     settings = load_config(None, {"seed": 4, "trpo.max_kl": 0.02})
     add_run(store, tmp_path, DEMO, load_config(), name=None)
