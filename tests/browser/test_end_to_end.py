@@ -11,7 +11,7 @@ from contextlib import closing
 import pytest
 
 from browser.test_page import drag_slider, opened, shown_clip, until
-from helpers.paths import VIDEOS
+from helpers.paths import PERSON
 from helpers.server_process import Serving
 from onedemo.app.cli.main import main
 from onedemo.storage.store import FILE_NAME
@@ -19,7 +19,6 @@ from onedemo.storage.store import FILE_NAME
 pytestmark = pytest.mark.seam
 
 
-PERSON = VIDEOS / "person_backflip_480.mp4"
 # Few ratings, small iterations: the whole way in a minute. Everything else is as it is for people.
 SETTINGS = {
     "ratings.pretrain": 5,
@@ -110,7 +109,7 @@ def test_five_ratings_by_key_button_and_slider(chromium, serving, tmp_path, meth
 
 def test_the_same_with_a_real_person_as_the_demo(chromium, serving, tmp_path):
     if not PERSON.exists():
-        pytest.skip(f"no video of a person at {PERSON.name} beside the checkout")
+        pytest.skip("ONEDEMO_PERSON_VIDEO names no video")
     add = ["demo", "add", str(PERSON), "--name", "person", "--data-dir", str(serving.data_dir)]
     assert main(add) == 0
     rate_five_and_look(chromium, serving, tmp_path, "--demo", "person")

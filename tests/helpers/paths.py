@@ -9,5 +9,3 @@ DEMOS = ROOT / "static" / "demos"
 DATABASES = TESTS / "data" / "databases"
 PERSON = Path(os.environ.get("ONEDEMO_PERSON_VIDEO") or "no-such-video.mp4")
 """A video of a real person, which is no part of the repository; tests that want it are skipped without."""
-VIDEOS = PERSON.parent
-"""Others of its kind."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import onedemo
-from helpers.paths import VIDEOS
+from helpers.paths import PERSON
 from onedemo.annotators.oracle import make_rater
 from onedemo.annotators.scripted import Script, load_marks, marked, table_path, visible
 from onedemo.demos.library import import_video
@@ -18,7 +18,6 @@ from onedemo.types import Demo, Segment
 
 TABLE = Path(onedemo.__file__).parent / "experiments" / "jobs" / "person_backflip.json"
 
-VIDEO = VIDEOS / "person_backflip_480.mp4"
 DT, STEPS, W = 0.008, 275, 38
 
 
@@ -163,11 +162,9 @@ def test_a_bad_table_is_one_sentence(table, sentence, person, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    not VIDEO.exists(), reason="needs the video of a real person, which is not in the repository"
-)
+@pytest.mark.skipif(not PERSON.is_file(), reason="ONEDEMO_PERSON_VIDEO names no video")
 def test_the_marks_fit_the_real_video(tmp_path):
-    demo = import_video(VIDEO, name="person", demos_dir=tmp_path)
+    demo = import_video(PERSON, name="person", demos_dir=tmp_path)
     marks = load_marks(TABLE, demo)
     assert marks[-1, 0] == pytest.approx((demo.frames - 1) / demo.fps, abs=1e-3)
     assert 350 < marks[-1, 1] <= 360 and marks[0, 1] < -60

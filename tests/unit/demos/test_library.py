@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.paths import ROOT, VIDEOS
+from helpers.paths import PERSON, ROOT
 from onedemo.demos import library as demos
 from onedemo.demos.library import find_demo, import_video, list_demos, read_frames, render_demo, show
 from onedemo.demos.video import VideoReader, count_frames, resample, write_webm
@@ -19,7 +19,6 @@ from onedemo.errors import UserError
 
 WIDTH, HEIGHT = 160, 96
 
-REAL_VIDEOS = VIDEOS
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".avi": "MJPG", ".mkv": "VP80"}
 
 
@@ -375,8 +374,8 @@ def test_written_files_are_webm(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.skipif(not REAL_VIDEOS.is_dir(), reason="the real videos are not beside the repository")
+@pytest.mark.skipif(not PERSON.is_file(), reason="ONEDEMO_PERSON_VIDEO names no video")
 def test_a_real_person(library):
-    demo = import_video(REAL_VIDEOS / "person_backflip_480.mp4", name="person", demos_dir=library, end=1.0)
+    demo = import_video(PERSON, name="person", demos_dir=library, end=1.0)
     assert (demo.frames, demo.width, demo.height) == (30, 480, 480)
     assert read_frames(demo).std() > 20
