@@ -154,7 +154,13 @@ class Watch:
         # A model of its own, as the scene writes into it; without the floor, which is drawn calmer here.
         scene = ViserMujocoScene(self._client, drawn_model(self._live.model_path), num_envs=1)  # type: ignore[arg-type]
         scene.camera_tracking_enabled = False
-        self._client.scene.add_grid(
+        # Two lamps instead of an environment map, whose shaders hold a browser without a GPU for seconds.
+        shown = self._client.scene
+        shown.configure_environment_map(None)
+        shown.configure_default_lights(False)
+        shown.add_light_directional("/lights/key", intensity=3.0, position=(0.5, -1.5, 4.0), cast_shadow=True)
+        shown.add_light_directional("/lights/fill", intensity=1.5, position=(-1.5, -4.0, -1.0))
+        shown.add_grid(
             "/fixed_bodies/floor",
             infinite_grid=True,
             cell_size=0.5,
