@@ -485,7 +485,7 @@ def test_nothing_that_is_loaded_can_run_code():
     """No pickle anywhere: weights and arrays are read as data alone."""
     runs_code = r"allow_pickle=True|weights_only=False|(?<![.\w])(eval|exec)\("
     loads = 0
-    for path in [*ROOT.glob("app/*.py"), *ROOT.glob("trainer/**/*.py")]:
+    for path in [*ROOT.glob("app/**/*.py"), *ROOT.glob("trainer/**/*.py")]:
         text = path.read_text()
         assert not re.search(r"^\s*(import|from) (shelve|dill|joblib|marshal)\b|from pickle", text, re.M), (
             path

@@ -1,9 +1,7 @@
 """EfficientNet-Lite0 made ready for looking only: the same function in fewer and longer steps.
 
-Batch normalisation is folded into the convolution before it; a convolution, its ReLU6 and the skip
-connection's sum are then one call of oneDNN, the library behind PyTorch's convolutions. PyTorch's
-compiler makes the same calls, but wants a C++ compiler on the user's machine. Where PyTorch comes
-without oneDNN, the folded layers run one operation at a time.
+Batch normalisation is folded into the convolution before it, what follows a convolution is done in
+place, and wide maps go through one frame at a time.
 
 Shapes: b frames, C channels, H rows, W columns.
 """
@@ -25,22 +23,15 @@ BATCH = 4
 _SMALL_SIDE = 28
 
 
-def has_fused() -> bool:
-    """Whether this PyTorch has oneDNN's fused convolutions."""
-    return torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise")
-
-
 class Folded:
     """The convolutions of an EfficientNet-Lite of ``efficientnet_lite_pytorch``, up to the last.
 
     Args:
         network: The package's network with its weights; not changed.
-        fused: Use oneDNN's fused calls; None: where there are any.
     """
 
-    def __init__(self, network: Any, *, fused: bool | None = None) -> None:
-        fused = has_fused() if fused is None else fused
-        self._stem = _Layer(network._conv_stem, network._bn0, SIDE, clamp=True, fused=fused)
+    def __init__(self, network: Any) -> None:
+        self._stem = _Layer(network._conv_stem, network._bn0, SIDE, clamp=True)
         side = self._stem.side
         self._blocks: list[tuple[list[_Layer], bool]] = []
         for block in network._blocks:
@@ -51,12 +42,12 @@ class Folded:
                 (block._depthwise_conv, block._bn1, True),
                 (block._project_conv, block._bn2, False),
             ):
-                layers.append(_Layer(convolution, normalisation, side, clamp=clamp, fused=fused))
+                layers.append(_Layer(convolution, normalisation, side, clamp=clamp))
                 side = layers[-1].side
             about = block._block_args
             stays = block._depthwise_conv.stride[0] == 1 and about.input_filters == about.output_filters
             self._blocks.append((layers, bool(block.id_skip and stays)))
-        self._head = _Layer(network._conv_head, network._bn1, side, clamp=True, fused=fused)
+        self._head = _Layer(network._conv_head, network._bn1, side, clamp=True)
         sides = [layers[-1].side for layers, _ in self._blocks]
         self._wide = next(i for i, side in enumerate(sides) if side <= _SMALL_SIDE) + 1
 
@@ -81,7 +72,7 @@ def _through(blocks: list[tuple[list[_Layer], bool]], x: torch.Tensor) -> torch.
 class _Layer:
     """A convolution with all that comes before the next; ``side`` is that of its output."""
 
-    def __init__(self, convolution: Any, normalisation: Any, side: int, *, clamp: bool, fused: bool) -> None:
+    def __init__(self, convolution: Any, normalisation: Any, side: int, *, clamp: bool) -> None:
         weight, bias = nn.utils.fuse_conv_bn_weights(
             convolution.weight, convolution.bias, normalisation.running_mean, normalisation.running_var,
             normalisation.eps, normalisation.weight, normalisation.bias,
@@ -95,26 +86,14 @@ class _Layer:
             # TensorFlow pads one more at the end than at the start. Taps of zero at the start of the
             # kernel give the same with equal padding, and spare a copy of the whole input.
             weight = F.pad(weight, (end - start, 0, end - start, 0))
-        weight = weight.contiguous(memory_format=torch.channels_last)
+        self._weight = weight.contiguous(memory_format=torch.channels_last)
         self.side = (side + 2 * end - weight.shape[-1]) // convolution.stride[0] + 1
-        self._bias, self._clamp, self._fused = bias.detach(), clamp, fused
-        self._how = ([end, end], list(convolution.stride), [1, 1], convolution.groups)
-        if fused:
-            batch = BATCH if side <= _SMALL_SIDE else 1
-            shape = [batch, convolution.in_channels, side, side]
-            weight = torch._C._nn.mkldnn_reorder_conv2d_weight(weight.to_mkldnn(), *self._how, shape)
-        self._weight = weight
+        self._bias, self._clamp = bias.detach(), clamp
+        self._how = (convolution.stride, end, 1, convolution.groups)
 
     def __call__(self, x: torch.Tensor, skip: torch.Tensor | None = None) -> torch.Tensor:
         """The output; with ``skip`` it is added to that tensor, in place."""
         x = F.pad(x, self._pad) if any(self._pad) else x
-        if not self._fused:
-            y = F.conv2d(x, self._weight, self._bias, self._how[1], self._how[0], 1, self._how[3])
-            y = F.hardtanh_(y, 0.0, 6.0) if self._clamp else y
-            return y if skip is None else skip.add_(y)
-        ops = torch.ops.mkldnn
-        if skip is None:
-            unary = ("hardtanh", [0.0, 6.0], "") if self._clamp else ("none", [], "")
-            return ops._convolution_pointwise(x, self._weight, self._bias, *self._how, *unary)
-        binary = ("add", 1.0, None, [], None)
-        return ops._convolution_pointwise_.binary(skip, x, self._weight, self._bias, *self._how, *binary)
+        y = F.conv2d(x, self._weight, self._bias, *self._how)
+        y = F.hardtanh_(y, 0.0, 6.0) if self._clamp else y
+        return y if skip is None else skip.add_(y)

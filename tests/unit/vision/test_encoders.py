@@ -20,9 +20,7 @@ from onedemo.vision.encoders import (
     published_lite0,
     vgg16_layers,
 )
-from onedemo.vision.folded import Folded, has_fused
-
-needs_fused = pytest.mark.skipif(not has_fused(), reason="this PyTorch comes without oneDNN")
+from onedemo.vision.folded import Folded
 
 
 @pytest.fixture(scope="module")
@@ -73,13 +71,12 @@ def test_features_are_what_the_network_classifies_by(efficientnet):
     assert torch.allclose(network._fc(features), direct, atol=1e-3)
 
 
-@pytest.mark.parametrize("fused", [False, pytest.param(True, marks=needs_fused)])
-def test_folding_changes_nothing(fused):
+def test_folding_changes_nothing():
     pixels = torch.randn((3, 3, 224, 224), generator=torch.Generator().manual_seed(0))
     network = published_lite0()
     with torch.inference_mode():
         wanted = network.extract_features(pixels)
-        maps = Folded(network, fused=fused)(pixels)
+        maps = Folded(network)(pixels)
     assert maps.shape == wanted.shape
     assert (maps - wanted).norm() < 1e-5 * wanted.norm()
 
