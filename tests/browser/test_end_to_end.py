@@ -11,8 +11,8 @@ from contextlib import closing
 import pytest
 
 from browser.test_page import drag_slider, opened, shown_clip, until
-from helpers.paths import PERSON
 from helpers.server_process import Serving
+from helpers.stick_figure import backflip_video
 from onedemo.app.cli.main import main
 from onedemo.storage.store import FILE_NAME
 
@@ -99,20 +99,18 @@ def rate_five_and_look(chromium, serving, tmp_path, *options):
     return links, expected
 
 
-@pytest.mark.parametrize("method", ["onedemo", "paper"])
-def test_five_ratings_by_key_button_and_slider(chromium, serving, tmp_path, method):
-    links, _ = rate_five_and_look(chromium, serving, tmp_path, "--method", method)
+def test_ratings_teach_another_body_filmed_by_anybody(chromium, serving, tmp_path):
+    video = backflip_video(tmp_path / "filmed.mp4")
+    add = ["demo", "add", str(video), "--name", "figure", "--data-dir", str(serving.data_dir)]
+    assert main(add) == 0
+    rate_five_and_look(chromium, serving, tmp_path, "--demo", "figure")
+
+
+def test_ratings_teach_the_papers_method(chromium, serving, tmp_path):
+    links, _ = rate_five_and_look(chromium, serving, tmp_path, "--method", "paper")
     with opened(chromium, links["researcher"], SMALL) as page:
         page.click('.od-tabs >> text="Data"')
-        page.wait_for_selector(f".od-data >> text=method {method}")
-
-
-def test_the_same_with_a_real_person_as_the_demo(chromium, serving, tmp_path):
-    if not PERSON.exists():
-        pytest.skip("ONEDEMO_PERSON_VIDEO names no video")
-    add = ["demo", "add", str(PERSON), "--name", "person", "--data-dir", str(serving.data_dir)]
-    assert main(add) == 0
-    rate_five_and_look(chromium, serving, tmp_path, "--demo", "person")
+        page.wait_for_selector(".od-data >> text=method paper")
 
 
 def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
