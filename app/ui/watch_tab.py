@@ -60,7 +60,8 @@ class Watch:
         self._picture = gui.add_html("")
         self._time = gui.add_html("")
         self._parts = gui.add_html(str(progress.timeline_html([], self._demo.seconds)))
-        gui.add_html(str(preload_html(self._demo.frames, self._demo.sha256)))
+        frames = [frame_address(n, self._demo.sha256) for n in range(self._demo.frames)]
+        gui.add_html(str(render("watch.html:preload", sources=frames)))
         self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
         self._classes = gui.add_html("")
         self._gallery = gui.add_html("")
@@ -213,11 +214,6 @@ def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> 
         demo_seconds=demo_seconds, length=length, note=note,
         attempt=seconds if abs(seconds - demo_seconds) >= _APART_SECONDS else None,
     )  # fmt: skip
-
-
-def preload_html(frames: int, sha256: str) -> Markup:
-    """All frames of the demo, out of sight."""
-    return render("watch.html:preload", sources=[frame_address(n, sha256) for n in range(frames)])
 
 
 def drawn_model(path: Path) -> mujoco.MjModel:
