@@ -7,6 +7,7 @@ from pathlib import Path
 import viser
 
 from onedemo import static
+from onedemo.app.templates import render
 
 STATIC = Path(static.__file__).parent
 SERVED = {".css", ".js", ".svg", ".png", ".webp"}
@@ -15,14 +16,6 @@ PUBLIC = {"/static/login.css", "/static/icon.svg"}
 """What the login page needs, served without a session."""
 
 _VISER_HTML = Path(viser.__file__).parent / "client" / "build" / "index.html"
-
-_HEAD = """<title>onedemo</title>
-<meta name="color-scheme" content="light dark">
-<link rel="icon" href="/static/icon.svg" type="image/svg+xml">
-<link rel="stylesheet" href="/static/page.css">
-<script src="/static/player.js"></script>
-<script src="/static/page.js"></script>
-"""
 
 
 def page_html() -> str:
@@ -37,4 +30,4 @@ def page_html() -> str:
     before, title, after = rest.partition("<title>Viser</title>")
     if not (icon and end_of_icon and title):
         raise ValueError("Viser's page has changed: no icon or title where they were")
-    return f"{start}{before}{_HEAD}{after}"
+    return "".join((start, before, render("head.html"), after))

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable
-from html import escape
 from typing import Literal, NamedTuple
 
 from aiohttp import web
 
-from onedemo.app.http import assets
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
 from onedemo.app.http.tokens import hash_token, new_session_token
+from onedemo.app.templates import render
 from onedemo.storage.accounts import SESSION_DAYS, Link
 from onedemo.storage.store import Store
 from onedemo.types import Rater
@@ -75,7 +74,6 @@ class Door:
         self._listening = listening
         self._port = port
         self._wrong = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
-        self._login = (assets.STATIC / "login.html").read_text()
 
     def application(self, routes: Iterable[Route]) -> web.Application:
         """A server of these routes and nothing else."""
@@ -149,11 +147,9 @@ class Door:
         # Browsers share cookies between the ports of a host; two studies on one machine must not.
         return f"onedemo-{self._port()}-{rater}"
 
-    def _login_page(self, status: int, note: str = "", form: str = "") -> web.Response:
-        html = self._login.replace("<!-- note -->", note)
-        if form:
-            start, end = html.index("<h1>"), html.index("</main>")
-            html = html[:start] + form + html[end:]
+    def _login_page(self, status: int, note: str = "", token: str = "") -> web.Response:
+        """What to do without a session; with a token, the button that opens its link."""
+        html = render("login.html", note=note, token=token, days=SESSION_DAYS)
         return web.Response(text=html, content_type="text/html", status=status)
 
     async def log_in(self, request: web.Request) -> web.StreamResponse:
@@ -167,7 +163,7 @@ class Door:
             return self._login_page(200)
         link = await asyncio.to_thread(self._store.link, hash_token(token))
         if link is not None and link.once and link.state == "open":
-            response = self._login_page(200, form=_BUTTON.format(token=escape(token)))
+            response = self._login_page(200, token=token)
             # With no-referrer a browser would not say that it is this page that posts the form.
             response.headers["Referrer-Policy"] = "same-origin"
             return response
@@ -229,14 +225,6 @@ _REFUSED = {
     "expired": "The time of this link is over. Please ask for another.",
     "revoked": "This link was withdrawn. Please ask for another if you still take part.",
 }
-_BUTTON = f"""<h1>Your link opens once</h1>
-      <p>Press the button in the browser in which you want to take part. You can then come back to it for
-      {SESSION_DAYS} days.</p>
-      <form method="post" action="/login">
-        <input type="hidden" name="token" value="{{token}}">
-        <button>Come in</button>
-      </form>
-    """
 
 
 def same_origin(request: web.Request) -> bool:

@@ -6,7 +6,6 @@ import asyncio
 import tempfile
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
-from html import escape
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from aiohttp import web
 from onedemo.app.dataset import ratings_csv
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import RATINGS
+from onedemo.app.templates import render
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.ratings import SKIP_COLUMNS
 from onedemo.storage.store import Store
@@ -102,7 +102,7 @@ class Downloads:
         rows = self._store.iter_ratings(**filters)
         shown = list(islice(rows, _SHOWN))
         more = sum(1 for _ in rows)
-        return preview_html(shown, len(shown) + more)
+        return render("data.html:preview", rows=shown, count=len(shown) + more, columns=RATINGS)
 
     def _attachment(self, what: str, suffix: str, kind: str) -> web.StreamResponse:
         response = web.StreamResponse(headers=dict(self._headers))
@@ -127,27 +127,3 @@ def read_filters(query) -> dict[str, Any]:
         if value:
             filters[name] = int(value) if name in _NUMBERS else value
     return filters
-
-
-def preview_html(rows: list[tuple], count: int) -> str:
-    """The first of some ratings as a table.
-
-    Args:
-        rows: In the order of the columns.
-        count: How many there are in all.
-    """
-    if not rows:
-        return '<p class="od-quiet">There are no such ratings.</p>'
-    heads = "".join(f'<th scope="col" title="{escape(text)}">{name}</th>' for name, text in RATINGS.items())
-    body = "".join(f"<tr>{''.join(f'<td>{_cell(cell)}</td>' for cell in row)}</tr>" for row in rows)
-    shown = f"the first {len(rows)} of {count:,}" if count > len(rows) else f"all {count:,}"
-    return (
-        f'<p class="od-quiet">{shown} ratings</p><div class="od-scroll" tabindex="0" role="region" '
-        f'aria-label="Preview"><table><thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table></div>'
-    )
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    return f"{value:.3g}" if isinstance(value, float) else escape(str(value))

@@ -127,25 +127,3 @@ def _options(fields: dict[str, str]) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"the part of the video {error}") from None
     return {"name": fields.get("name", ""), "crop": crop, "mirror": fields.get("mirror") == "on", **times}
-
-
-def form_html() -> str:
-    """The form on the Runs tab; the video is its last field, as ``Uploads.add`` wants it."""
-    return (
-        '<article class="od-data od-new-run"><section><h3>New demonstration</h3>'
-        '<form class="od-filter" data-upload="/demos">'
-        '<label>Name <input name="name" maxlength="64" required pattern="[A-Za-z0-9_\\-]+" '
-        'title="Letters, digits, - and _" placeholder="somersault"></label>'
-        '<label>From second <input name="start" inputmode="decimal" maxlength="10" placeholder="its start">'
-        "</label>"
-        '<label>To second <input name="end" inputmode="decimal" maxlength="10" placeholder="its end"></label>'
-        '<label>Only this part, pixels <input name="crop" maxlength="40" '
-        'placeholder="x, y, width, height"></label>'
-        '<label>Faces left <select name="mirror"><option value="">no</option>'
-        '<option value="on">yes: mirror it</option></select></label>'
-        '<label class="od-file">Video <input name="video" type="file" accept="video/*,.gif" required></label>'
-        '<button class="od-button od-primary">Upload</button></form>'
-        '<p class="od-form-note" role="status"></p>'
-        f"<p class=od-quiet>mp4, webm, mov, avi or gif, up to 60 s and {LARGEST >> 20} MB. The robot faces "
-        "right: mirror a video in which the person faces left.</p></section></article>"
-    )

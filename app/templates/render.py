@@ -12,21 +12,26 @@ from markupsafe import Markup
 @cache
 def environment() -> Environment:
     """Autoescape everywhere; a value that is not given is an error, not an empty place."""
-    return Environment(
+    found = Environment(
         loader=PackageLoader("onedemo.app", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        auto_reload=False,  # else the time of the file is looked up at every call
     )
+    found.filters |= {"number": number, "steps": steps}
+    return found
 
 
 def render(template: str, /, **values: Any) -> Markup:
     """The markup of a template.
 
+    Viser sends no ``Markup``: what goes into one of its handles is ``str(render(...))``.
+
     Args:
-        template: Its file name, such as ``watch.html``; ``watch.html:figures`` is its macro ``figures``,
-            called with the values as keywords.
+        template: Its file name, such as ``login.html``; ``watch.html:strip`` is its macro ``strip``,
+            called with the values as keywords. A file is either a page or a collection of macros.
         values: What it names.
 
     Raises:
@@ -36,4 +41,17 @@ def render(template: str, /, **values: Any) -> Markup:
     found = environment().get_template(name)
     if not macro:
         return Markup(found.render(values))
-    return Markup(getattr(found.module, macro)(**values))
+    # Stripped: the style sheet asks whether a place is empty, and a line break would fill it.
+    return Markup(getattr(found.module, macro)(**values).strip())
+
+
+def number(value: float | None, form: str = "") -> str:
+    """Filter: a number as ``format`` writes it; a dash where there is none."""
+    return "–" if value is None else format(value, form)
+
+
+def steps(count: int) -> str:
+    """Filter: a number of control steps, in a few characters."""
+    if count >= 1_000_000:
+        return f"{count / 1_000_000:.2f} M"
+    return f"{count / 1000:.0f} k" if count >= 10_000 else f"{count}"

@@ -1,4 +1,4 @@
-"""Curves of a run, and its ratings by class."""
+"""Curves of a run, and of several runs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-
-from onedemo.app.annotation.scale import ANSWERS
 
 _TRUE_REWARD = "True reward (points; never trained on)"
 _POINTS = 1500
@@ -177,23 +175,3 @@ def curve_points(rows: list[dict], key: str, most: int = _POINTS) -> tuple[np.nd
     kept = points[::-1][::stride][::-1]
     x, y = zip(*kept, strict=True)
     return np.array(x, np.float64), np.array(y, np.float64)
-
-
-def classes_html(counts: list[int]) -> str:
-    """Ratings by class as bars."""
-    most = max(1, *counts)
-    total = sum(counts)
-    rows = "".join(
-        f'<li><span><b>{value}</b> {answer}</span><i><i style="width:{100 * count / most:.1f}%"></i></i>'
-        f"<em>{count}</em></li>"
-        for value, (answer, count) in enumerate(zip(ANSWERS, counts, strict=True), start=1)
-    )
-    heading = f"<h3>Ratings by class <small>{total} in all</small></h3>"
-    return f'<section class="od-classes">{heading}<ul>{rows}</ul></section>'
-
-
-def short(steps: int) -> str:
-    """A number of control steps, in a few characters."""
-    if steps >= 1_000_000:
-        return f"{steps / 1_000_000:.2f} M"
-    return f"{steps / 1000:.0f} k" if steps >= 10_000 else f"{steps}"

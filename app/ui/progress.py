@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from markupsafe import Markup
+
+from onedemo.app.templates import render
+
 _SHOWN = 12
 """Iterations in the gallery."""
 
 
-def timeline_html(rows: Sequence[dict], seconds: float) -> str:
+def timeline_html(rows: Sequence[dict], seconds: float) -> Markup:
     """Predicted rating along the demo, of the newest iteration that has one.
 
     Args:
@@ -17,16 +21,14 @@ def timeline_html(rows: Sequence[dict], seconds: float) -> str:
     """
     row = next((row for row in reversed(rows) if row.get("timeline")), None)
     if row is None:
-        return '<section class="od-parts od-empty"></section>'
+        return render("watch.html:no_timeline")
     parts = row["timeline"]
-    cells, known = "", [part for part in parts if part is not None]
+    known = [part for part in parts if part is not None]
+    cells = []
     for index, part in enumerate(parts):
         start, end = (seconds * k / len(parts) for k in (index, index + 1))
-        title = f"{start:.1f} to {end:.1f} s: " + ("not reached" if part is None else f"{part:.1f}")
-        if part is None:
-            cells += f'<i data-none title="{title}"></i>'
-        else:
-            cells += f'<i style="--od-rated:{round(100 * (part - 1) / 4)}%" title="{title}"></i>'
+        percent, rating = (None, "not reached") if part is None else (round(25 * (part - 1)), f"{part:.1f}")
+        cells.append((percent, f"{start:.1f} to {end:.1f} s: {rating}"))
     if known:
         weakest = seconds * (parts.index(min(known)) + 0.5) / len(parts)
         told = f"between {min(known):.1f} and {max(known):.1f}; weakest at {weakest:.1f} s"
@@ -34,15 +36,10 @@ def timeline_html(rows: Sequence[dict], seconds: float) -> str:
             told += f"; {seconds * missing / len(parts):.1f} s not reached (dashed)"
     else:
         told = "no part was reached"
-    dashes = "<i data-none></i> not reached" if None in parts else ""
-    return (
-        '<section class="od-parts"><h3>Predicted rating along the video '
-        f"<small>iteration {row['number']:,}; {told}</small></h3>"
-        f'<div class="od-cells" role="img" aria-label="Predicted rating along the video: {told}">'
-        f"{cells}</div>"
-        f'<p class="od-scale-note"><span>0 s</span><span class="od-legend">1 <i></i> 5{dashes}</span>'
-        f"<span>{seconds:.1f} s</span></p></section>"
-    )
+    return render(
+        "watch.html:timeline", iteration=row["number"], cells=cells, told=told, missing=None in parts,
+        seconds=seconds,
+    )  # fmt: skip
 
 
 def chosen(numbers: Sequence[int], most: int = _SHOWN) -> list[int]:
@@ -53,7 +50,7 @@ def chosen(numbers: Sequence[int], most: int = _SHOWN) -> list[int]:
     return [numbers[round(last * (most - 1 - k) / (most - 1))] for k in range(most)]
 
 
-def gallery_html(rows: Sequence[dict], version: str) -> str:
+def gallery_html(rows: Sequence[dict], version: str) -> Markup:
     """The best rollout of some iterations: a filmstrip each, which opens as a video.
 
     Args:
@@ -61,26 +58,5 @@ def gallery_html(rows: Sequence[dict], version: str) -> str:
         version: Of the run's pictures, as ``pictures.version_of``.
     """
     best = {row["number"]: row["best"] for row in rows if row.get("best") is not None}
-    if not best:
-        return ""
-    cards = "".join(
-        f'<li><button type="button" data-video="/rollouts/{number}.webm?v={version}" '
-        f'aria-label="Play the best rollout of iteration {number}">'
-        f'<img src="/rollouts/{number}.jpg?v={version}" alt="" loading="lazy" '
-        'width="960" height="120"></button>'
-        f"<p><b>Iteration {number:,}</b> predicted rating {best[number]:.1f} "
-        f'<a href="/rollouts/{number}.webm?v={version}" download="onedemo-iteration-{number}.webm">'
-        "Download video</a></p></li>"
-        for number in chosen(list(best))
-    )
-    return (
-        '<section class="od-gallery"><h3>Best rollout of an iteration <small>the newest first</small></h3>'
-        f"<ol>{cards}</ol></section>"
-    )
-
-
-PLAYER = (
-    '<dialog class="od-film" aria-label="Best rollout of an iteration">'
-    "<video controls playsinline loop></video>"
-    '<form method="dialog"><button class="od-button od-primary">Close</button></form></dialog>'
-)
+    cards = [(number, best[number]) for number in chosen(list(best))]
+    return render("watch.html:gallery", cards=cards, version=version)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import TYPE_CHECKING, Any
 
-from onedemo.app.http.uploads import form_html
+from markupsafe import Markup
+
+from onedemo.app.http.uploads import LARGEST
+from onedemo.app.templates import render
 from onedemo.app.ui import charts
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
@@ -48,8 +50,10 @@ class Runs:
             )
         ]
         demos = [demo.name for demo in list_demos(page.trainer.data_dir / "demos")]
-        gui.add_html(new_run_html(demos, [entry["id"] for entry in self._store.runs()]))
-        gui.add_html(form_html())
+        # The forms are drawn once, so that nothing that is being filled in is lost.
+        runs = [entry["id"] for entry in self._store.runs()]
+        gui.add_html(str(render("runs.html:new_run", demos=demos, methods=list(METHODS), runs=runs)))
+        gui.add_html(str(render("runs.html:new_demo", megabytes=LARGEST >> 20)))
 
     def show(self) -> None:
         """Lists the runs."""
@@ -75,13 +79,13 @@ class Runs:
                     new = self._store.iterations(run, after=rows[-1]["number"] if rows else 0)
                     rows += new
                     grown |= bool(new)
-            told = runs_html(runs, self._figures(runs), self._run, status, drawn)
+            told = str(runs_html(runs, self._figures(runs), self._run, status, drawn))
             with self._client.atomic():
                 if told != self._told:
                     self._told = self._table.content = told
                 if grown or not self._told_which.content:
                     self._drawn = drawn
-                    self._told_which.content = which_html(drawn, more)
+                    self._told_which.content = str(render("runs.html:which", drawn=len(drawn), more=more))
                     for curve in self._curves:
                         curve.draw({run: self._rows[run] for run in drawn})
 
@@ -125,21 +129,10 @@ def chosen_runs(runs: Sequence[str], wanted: str, current: str) -> tuple[list[st
     return found[:_COMPARED], max(0, len(found) - _COMPARED)
 
 
-def which_html(drawn: Sequence[str], more: int) -> str:
-    """What the curves show, in words."""
-    if not drawn:
-        told = "No run has such a name."
-    elif more:
-        told = f"The newest {len(drawn)} of {len(drawn) + more} such runs are drawn."
-    else:
-        told = f"{len(drawn)} run{'' if len(drawn) == 1 else 's'} drawn."
-    return f'<p class="od-which od-quiet" role="status">{told}</p>'
-
-
 def runs_html(
     runs: Sequence[Mapping[str, Any]], figures: Mapping[str, Mapping[str, Any]], current: str,
     status: Status, drawn: Sequence[str],
-) -> str:  # fmt: skip
+) -> Markup:  # fmt: skip
     """The table of runs, the newest first.
 
     Args:
@@ -149,74 +142,11 @@ def runs_html(
         status: Of that one.
         drawn: Those whose curves are drawn.
     """
-    heads = (
-        "Run", "Demonstration", "Method", "Seed", "Ratings", "Iterations", "Control steps",
-        "Predicted rating", "True reward", "Compare", "",
+    return render(
+        "runs.html:table",
+        rows=[(run, figures[run["id"]], method_of(run["config"])) for run in reversed(runs)],
+        current=current, status=status, resumable=status.phase in HALTED, drawn=drawn,
     )  # fmt: skip
-    rows = ""
-    for run in reversed(runs):
-        name, row = run["id"], figures[run["id"]]
-        here = name == current
-        what = f'data-do="open run" data-run="{escape(name)}"'
-        action = f'<button type="button" class="od-button od-small" {what}>Open</button>'
-        if here:
-            action = _here_html(status)
-        cells = (
-            escape(run["demo"]), escape(method_of(run["config"])), run["seed"], row["ratings"],
-            f"{row['number']:,}" if "number" in row else "–",
-            charts.short(row["env_steps"]) if "env_steps" in row else "–",
-            _figure(row.get("predicted"), "of 5"), _figure(row.get("true_reward"), "points"),
-            f'<button type="button" class="od-button od-small" data-compare="{escape(name)}" '
-            f'aria-pressed="{str(name in drawn).lower()}" aria-label="Compare {escape(name)}">'
-            f"{'✓' if name in drawn else '+'}</button>",
-            action,
-        )  # fmt: skip
-        made = f"made {run['created_at'][:16].replace('T', ' ')} UTC"
-        rows += (
-            f'<tr{" class=od-current" if here else ""}>'
-            f'<th scope="row" title="{escape(made)}">{escape(name)}</th>'
-            + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
-        )  # fmt: skip
-    head = "".join(f'<th scope="col">{text}</th>' for text in heads)
-    return (
-        '<article class="od-data od-runs"><div class="od-data-top"><div><h1>Runs</h1>'
-        "<p>One at a time is trained and rated. Opening another stops this one after its iteration; nothing "
-        "is lost. To branch off a run, make a new one whose predictor starts from that run’s.</p></div></div>"
-        '<section><div class="od-scroll" tabindex="0" role="region" aria-label="Runs">'
-        f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div></section>"
-        "<h2>Compare</h2><p class=od-quiet>Tick a run in the column Compare, or write a part of its name."
-        "</p></article>"
-    )
-
-
-def _here_html(status: Status) -> str:
-    """What the run at hand does, and the button that halts it or lets it go on."""
-    act, label = ("resume", "Resume") if status.phase in HALTED else ("pause", "Pause")
-    button = f'<button type="button" class="od-button od-small" data-do="{act} run">{label}</button>'
-    return f"<b>{escape(status.phase)}</b> {button if status.phase != 'done' else ''}"
-
-
-def new_run_html(demos: Sequence[str], runs: Sequence[str]) -> str:
-    """The form for a new run. Drawn once, so that nothing that is being filled in is lost."""
-
-    def options(values: Sequence[str], first: str = "") -> str:
-        return first + "".join(f"<option>{escape(value)}</option>" for value in values)
-
-    nothing = '<option value="">nothing: from scratch</option>'
-    return (
-        '<article class="od-data od-new-run"><section><h3>New run</h3>'
-        '<form class="od-filter" data-act="new run">'
-        f'<label>Demonstration <select name="demo">{options(demos)}</select></label>'
-        f'<label>Method <select name="method">{options(list(METHODS))}</select></label>'
-        '<label>Seed <input name="seed" type="number" min="0" max="999999" value="0" required></label>'
-        '<label>Name <input name="name" maxlength="64" placeholder="given if left empty"></label>'
-        '<label>Predictor starts from <select name="predictor_from">'
-        f"{options(runs, nothing)}</select></label>"
-        '<button class="od-button od-primary">Start</button></form>'
-        '<p class="od-form-note" role="status"></p>'
-        "<p class=od-quiet>A run that starts from another’s predictor keeps what raters looked at there; it "
-        "must be of the same method.</p></section></article>"
-    )
 
 
 def method_of(config: str) -> str:
@@ -225,9 +155,3 @@ def method_of(config: str) -> str:
         if line.startswith("method = "):
             return line.partition('"')[2].rstrip('"')
     return "paper"
-
-
-def _figure(value: float | None, unit: str) -> str:
-    if value is None:
-        return "–"
-    return f"{value:,.{0 if unit == 'points' else 1}f} <small>{unit}</small>"

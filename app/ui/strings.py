@@ -1,17 +1,6 @@
-"""Words that several tabs use."""
+"""Words that several tabs use: the keys, and what they do."""
 
-
-def nobody_html(ratings: int, learned: int) -> str:
-    """For researchers, if there are ratings but all are left out of training: what happens now."""
-    if learned or not ratings:
-        return ""
-    return (
-        '<p class="od-nobody" role="status"><b>Everybody is left out of training.</b> Nothing new is '
-        "learned: the robot goes on practising with the last predictor it has, if it has one, and clips "
-        "go on being asked. Take somebody in again on the Data tab, and the next iteration learns from "
-        "their ratings.</p>"
-    )
-
+from onedemo.app.templates import render
 
 Keys = tuple[tuple[tuple[str, ...], str], ...]
 """Keys, and what they do."""
@@ -41,17 +30,6 @@ COMPARE_KEYS: Keys = (
 )
 
 
-def keys_html(keys: Keys = RATE_KEYS) -> str:
-    """Keys as a list."""
-    rows = "".join(
-        f"<li><span>{''.join(f'<kbd>{key}</kbd>' for key in names)}</span>{text}</li>" for names, text in keys
-    )
-    return f'<ul class="od-keys">{rows}</ul>'
-
-
 def keys_dialog(keys: Keys) -> str:
-    """The same, opened by "?"."""
-    return (
-        f'<dialog class="od-help" aria-label="Keys"><h2>Keys</h2>{keys_html(keys)}'
-        '<form method="dialog"><button class="od-button od-primary">Close</button></form></dialog>'
-    )
+    """Keys as a list, opened by "?"."""
+    return str(render("parts.html:keys_dialog", keys=keys))

@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 import threading
 import time
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
+from markupsafe import Markup
 from mjviser import ViserMujocoScene
 
+from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.services.demo_images import version_of
 from onedemo.app.services.live_rollout import Moment
+from onedemo.app.templates import render
 from onedemo.app.ui import charts, progress
-from onedemo.app.ui.strings import nobody_html
 from onedemo.types import HALTED, Status
 
 if TYPE_CHECKING:
@@ -31,16 +32,6 @@ _CAMERA_POSITION = (0.0, -3.0, 1.02)
 _CAMERA_TARGET = (0.0, 0.0, 1.02)
 _CAMERA_FOV = 45.0
 _LIMBS = ((0.91, 0.29, 0.17, 1.0), (0.13, 0.25, 0.47, 1.0), (0.20, 0.48, 0.76, 1.0), (0.97, 0.69, 0.15, 1.0))
-
-_PHASES = {
-    "starting": "Starting",
-    "pretrain": "Waiting for ratings",
-    "online": "Learning",
-    "paused": "Paused",
-    "done": "Done",
-    "stopped": "Stopped",
-    "failed": "Failed",
-}
 
 
 class Watch:
@@ -65,15 +56,16 @@ class Watch:
         self._content: dict[int, str] = {}
         gui = session.client.gui
         self._strip = gui.add_html("")
-        gui.add_html(_ROBOT)
+        gui.add_html(str(render("watch.html:robot")))
         self._picture = gui.add_html("")
         self._time = gui.add_html("")
-        self._parts = gui.add_html(progress.timeline_html([], self._demo.seconds))
-        gui.add_html(_preload(self._demo.frames, self._demo.sha256))
+        self._parts = gui.add_html(str(progress.timeline_html([], self._demo.seconds)))
+        frames = [frame_address(n, self._demo.sha256) for n in range(self._demo.frames)]
+        gui.add_html(str(render("watch.html:preload", sources=frames)))
         self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
         self._classes = gui.add_html("")
         self._gallery = gui.add_html("")
-        gui.add_html(progress.PLAYER)
+        gui.add_html(str(render("watch.html:film")))
         self._put(self._picture, frame_html(0, self._demo.sha256))
         self._put(self._time, time_html(0, 0, self._demo.seconds, ""))
 
@@ -104,16 +96,18 @@ class Watch:
                 return
             self._practised = status.iteration > 0
             store, run = self._trainer.store, self._trainer.run
-            nobody = nobody_html(sum(store.ratings_by_class(run)), store.count_learned(run))
-            self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until) + nobody)
-            new = self._trainer.store.iterations(self._trainer.run, after=self._charts.last)
+            counts = store.ratings_by_class(run)
+            strip = render(
+                "watch.html:strip", status=status, confirming=time.monotonic() < self._confirm_until,
+                ratings=sum(counts), learned=store.count_learned(run),
+            )  # fmt: skip
+            self._put(self._strip, strip)
+            self._put(self._classes, render("parts.html:classes", counts=counts, answers=ANSWERS))
+            new = store.iterations(run, after=self._charts.last)
             self._charts.extend(new)
             if new:
                 self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
                 self._put(self._gallery, progress.gallery_html(self._charts.rows, self._version))
-            self._put(
-                self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
-            )
 
     def close(self) -> None:
         """Leaves the live robot."""
@@ -194,48 +188,17 @@ class Watch:
                 self._put(self._time, where)
         self._client.flush()
 
-    def _put(self, handle: Any, content: str) -> None:
+    def _put(self, handle: Any, content: Markup) -> None:
         if self._content.get(id(handle)) != content:
-            self._content[id(handle)] = content
-            handle.content = content
+            handle.content = self._content[id(handle)] = str(content)
 
 
 _UNPRACTISED = "The robot has not practised yet: it needs ratings first."
-_ROBOT = '<figure class="od-view od-robot"><figcaption>Robot, live</figcaption><div></div></figure>'
 
 
-def strip_html(status: Status, confirming: bool) -> str:
-    """What the trainer does, in figures, and its controls."""
-    running = status.phase in ("starting", "pretrain", "online")
-    figures = [
-        ("Method", escape(status.method) or "–", ""),
-        ("Iteration", f"{status.iteration:,}", ""),
-        ("Steps", f"{charts.short(status.env_steps)}", f"of {charts.short(status.total_steps)}"),
-        ("Speed", f"{status.steps_per_s:,.0f}", "steps/s"),
-        ("Predictor", f"No. {status.snapshot}" if status.snapshot else "–", ""),
-        ("Ratings", f"{status.ratings}", f"of {status.target_ratings}"),
-    ]
-    cells = "".join(f"<div><dt>{n}</dt><dd>{v} <small>{u}</small></dd></div>" for n, v, u in figures)
-    toggle = "Pause" if running else "Try again" if status.phase == "failed" else "Resume"
-    no_toggle = " disabled" if status.phase == "done" else ""
-    no_stop = " disabled" if status.phase in ("done", "stopped") else ""
-    stop = "Press again to stop" if confirming else "Stop"
-    return (
-        f'<div class="od-strip"><div class="od-state" data-phase="{escape(status.phase)}">'
-        f"<b>{_PHASES.get(status.phase, escape(status.phase))}</b><span>{escape(status.message)}</span></div>"
-        f'<dl class="od-figures">{cells}</dl><div class="od-controls">'
-        f'<button type="button" class="od-button" data-key="alt+p"{no_toggle}>{toggle}</button>'
-        f'<button type="button" class="od-button od-danger" data-key="alt+x"{no_stop}>{stop}</button>'
-        "</div></div>"
-    )
-
-
-def frame_html(frame: int, sha256: str) -> str:
-    """One frame of the demo; ``decoding=sync`` paints it without a gap."""
-    return (
-        '<figure class="od-view od-demonstration"><figcaption>Demonstration</figcaption>'
-        f'<div><img src="{frame_address(frame, sha256)}" alt="" decoding="sync"></div></figure>'
-    )
+def frame_html(frame: int, sha256: str) -> Markup:
+    """One frame of the demo."""
+    return render("watch.html:frame", source=frame_address(frame, sha256))
 
 
 def frame_address(frame: int, sha256: str) -> str:
@@ -243,7 +206,7 @@ def frame_address(frame: int, sha256: str) -> str:
     return f"/demo/frames/{frame}.jpg?v={sha256[:8]}"
 
 
-def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> str:
+def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> Markup:
     """How far along the demo the robot is.
 
     Args:
@@ -252,18 +215,11 @@ def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> 
         length: Of the demo, seconds.
         note: One sentence below it.
     """
-    share = min(1.0, demo_seconds / length) if length else 0.0
-    taken = f", {seconds:.1f} s into the attempt" if abs(seconds - demo_seconds) >= _APART_SECONDS else ""
-    return (
-        f'<div class="od-time"><i><i style="width:{100 * share:.1f}%"></i></i>'
-        f"<span>Video at {demo_seconds:.1f} s of {length:.1f} s{taken}</span><em>{note}</em></div>"
-    )
-
-
-def _preload(frames: int, sha256: str) -> str:
-    # Once fetched they stay in the browser's memory as long as these elements are there.
-    images = "".join(f'<img src="{frame_address(n, sha256)}" alt="">' for n in range(frames))
-    return f'<div class="od-preload" aria-hidden="true">{images}</div>'
+    return render(
+        "watch.html:time", percent=100 * min(1.0, demo_seconds / length) if length else 0.0,
+        demo_seconds=demo_seconds, length=length, note=note,
+        attempt=seconds if abs(seconds - demo_seconds) >= _APART_SECONDS else None,
+    )  # fmt: skip
 
 
 def drawn_model(path: Path) -> mujoco.MjModel:

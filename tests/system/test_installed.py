@@ -49,8 +49,9 @@ def test_the_wheel_holds_one_name(wheel):
     assert {name.split("/")[0].split("-")[0] for name in names} == {"onedemo"}
     assert "onedemo/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
-    for needed in ("demos/hopper-backflip.webm", "demos/hopper-backflip.hidden.npz", "page.js", "login.html"):
+    for needed in ("demos/hopper-backflip.webm", "demos/hopper-backflip.hidden.npz", "page.js"):
         assert f"onedemo/static/{needed}" in names
+    assert {"onedemo/app/templates/login.html", "onedemo/app/templates/watch.html"} < set(names)
     assert "onedemo/experiments/jobs/person_backflip.json" in names
     assert not [name for name in names if "/tests/" in name or "/load/" in name]
 
