@@ -117,7 +117,7 @@ def fill_bank(
         qpos=flat["qpos"][chosen],
         qvel=flat["qvel"][chosen],
         clock=np.repeat(moments, _BANK_KEPT).astype(np.int32),
-        similarity=float(_similarity(np.concatenate(ratings)).mean()),
+        similarity=float(similarity(np.concatenate(ratings)).mean()),
     )
 
 
@@ -223,9 +223,9 @@ class PracticeRules(EpisodeRules):
         assert self._snapshot is not None
         frames = self._frames_of(np.minimum(clock, self._demo_steps - 1))
         ratings = self._snapshot.ratings(frames, step.next_obs, step.actions)
-        return _similarity(ratings)
+        return similarity(ratings)
 
 
-def _similarity(ratings: np.ndarray) -> np.ndarray:
+def similarity(ratings: np.ndarray) -> np.ndarray:
     """Ratings 1..5 as 0..1."""
     return np.clip((ratings - 1) / (CLASSES - 1), 0, 1)

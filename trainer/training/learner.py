@@ -18,7 +18,7 @@ from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
 from onedemo.queries.selection import Question, choose
-from onedemo.reward.episode_rules import PracticeRules, fill_bank
+from onedemo.reward.episode_rules import PracticeRules, fill_bank, similarity
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.rl.policy import Policy, PolicySnapshot, check_device
@@ -203,8 +203,10 @@ class Learner:
             predicted = 1 + 4 * self._rules.mean_similarity
         else:
             rollouts = self._collector.collect(policy, steps)
-            rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
-            predicted = float(rewards.mean())
+            frames = self.frames_of(rollouts.next_clock)
+            rewards = similarity(snapshot.ratings(frames, rollouts.next_obs, rollouts.actions))
+            rewards = rewards * (rollouts.next_clock - rollouts.clock)
+            predicted = 1 + 4 * float(rewards.mean())
         progress = min(1.0, self.env_steps / sizes.total_steps)
         stats = self._trpo.update(rollouts, rewards, progress=progress)
         self.iteration += 1
