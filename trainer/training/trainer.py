@@ -334,9 +334,7 @@ class Trainer:
         rollouts, stats = learner.iterate(snapshot)
         stats |= self._true_reward(rollouts)
         if self._gallery is not None:
-            stats |= self._gallery.note(
-                learner.iteration, snapshot, rollouts, learner.frames_of, learner.demo_steps
-            )
+            stats |= self._gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
         self._work_s = time.monotonic() - began
         stats["steps_per_s"] = (learner.env_steps - before) / self._work_s
         self._pool, self._policy = rollouts, learner.policy()

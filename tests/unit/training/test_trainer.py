@@ -207,7 +207,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
 def few_wild(monkeypatch):
     """Random states are drawn and tried in seconds."""
     monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 4)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 200)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 200)
 
 
 @pytest.mark.slow
@@ -272,7 +272,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     )  # fmt: skip
     clock = np.zeros(1, np.int32)
     for t in range(100):
-        step, _, clock = one.step(env, obs, clock, t)
+        step, clock = one.step(env, obs, clock)
         obs = step.next_obs
         assert clock[0] == expected.clock[0, t + 1]
     env.close()
@@ -350,6 +350,8 @@ def as_of_before(directory):
         torch.save(data, file)
     checkpoint = torch.load(directory / "checkpoint.pt", weights_only=True)
     del checkpoint["learner"]["rules"]
+    if checkpoint["pool"] is not None:
+        checkpoint["pool"]["env_rewards"] = checkpoint["pool"].pop("rewards")
     torch.save(checkpoint, directory / "checkpoint.pt")
 
 
@@ -490,7 +492,7 @@ def few_pictures(monkeypatch):
     monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
     monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
     monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 500)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 500)
 
 
 ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
