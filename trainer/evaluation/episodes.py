@@ -1,7 +1,7 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
 Evaluation may read hidden demo states; nothing in ``onedemo.training.learner`` or
-``onedemo.training.trainer`` may.
+``onedemo.training.training_run`` may.
 
 Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
