@@ -80,8 +80,8 @@ class Rollouts:
     """Normalised policy inputs, (N, T, i), float32."""
     next_inputs: np.ndarray
     """Normalised policy inputs of the state after the step, before any reset, (N, T, i), float32."""
-    env_rewards: np.ndarray
-    """The environment's own reward of the step, (N, T). Never used by the method; baselines learn from it."""
+    rewards: np.ndarray
+    """What each step was worth, (N, T), as the episode rules say; under plain ones the environment's own."""
     terminated: np.ndarray
     """True where the step reached a terminal state, (N, T), bool."""
     truncated: np.ndarray

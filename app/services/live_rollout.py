@@ -113,7 +113,7 @@ class Live:
                 if acting is None:  # the demo plays alone
                     clock, elapsed = (clock + 1) % self._horizon, (elapsed + 1) % self._horizon
                     continue
-                step, _, clock = acting.step(env, obs, clock, elapsed)
+                step, clock = acting.step(env, obs, clock)
                 obs, elapsed = step.next_obs, elapsed + 1
                 if max(elapsed, clock[0]) >= self._horizon:
                     obs, _ = env.reset()

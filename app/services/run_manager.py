@@ -19,7 +19,8 @@ from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
-from onedemo.training.trainer import Trainer
+from onedemo.training.thread import Trainer
+from onedemo.training.training_run import TrainingRun
 from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
 
@@ -46,7 +47,7 @@ class Study:
         self._store, self._data_dir, self._renderer = store, data_dir, renderer
         self._encoder_weights, self._device = encoder_weights, device
         self.served = served
-        self._held = ExitStack()
+        self._release: Callable[[], None] = lambda: None  # the run that is served
         self._change = threading.Lock()
 
     def serve(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
@@ -63,18 +64,18 @@ class Study:
         """
         encoder = make_encoder(config.encoder, self._encoder_weights)
         files = RunDirectory(self._data_dir, run)
-        held = ExitStack()
-        held.enter_context(hold(files.lock))
-        held.enter_context(_log_to(files.log))
-        trainer = Trainer(
-            store=self._store, data_dir=self._data_dir, run=run, demo=demo,
-            config=replace(config, device=self._device), encoder=encoder, renderer=self._renderer,
-            start=start,
-        )  # fmt: skip
-        self._held, before = held, self._held
-        self.trainer = trainer
-        before.close()
-        self.served(trainer)
+        with ExitStack() as held:
+            held.enter_context(hold(files.lock))
+            held.enter_context(_log_to(files.log))
+            training = TrainingRun(
+                store=self._store, data_dir=self._data_dir, run=run, demo=demo,
+                config=replace(config, device=self._device), encoder=encoder, renderer=self._renderer,
+                start=start,
+            )  # fmt: skip
+            self.trainer = Trainer(training, held.pop_all())
+        before, self._release = self._release, self.trainer.release
+        before()
+        self.served(self.trainer)
 
     def open(self, run: str) -> None:
         """Stops the run at hand after its iteration, and goes on with another.
@@ -127,7 +128,7 @@ class Study:
     def close(self) -> None:
         """Stops the run at hand."""
         self.trainer.stop()
-        self._held.close()
+        self._release()
 
     def _switch(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
         self.trainer.retire()

@@ -73,7 +73,7 @@ def arm(moment: str) -> None:
 
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
-    onedemo.training.learner._WILD_LANES, onedemo.reward.episode_rules._BANK_TRIES = 4, 200
+    onedemo.training.learner._WILD_LANES, onedemo.reward.episode_rules._BUFFER_TRIES = 4, 200
     config = small_world.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))

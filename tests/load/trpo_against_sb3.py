@@ -42,12 +42,12 @@ def ours(steps, seed):
     collector = Collector(env, seed=seed, stagger=False)
     for _ in range(steps // (LANES * BATCH)):
         batch = collector.collect(policy.snapshot(), BATCH)
-        trpo.update(batch, batch.env_rewards)
+        trpo.update(batch)
     seconds = time.monotonic() - started
     episodes = evaluate(policy.snapshot(), "hopper", episodes=EPISODES, seed=1000 + seed)
     upright = vector_env.healthy(env.env_spec, episodes.qpos, episodes.qvel)
     alive = np.logical_and.accumulate(upright[:, :-1], axis=1)  # the falling step still counts
-    return (episodes.env_rewards * alive).sum(1).mean(), seconds
+    return (episodes.rewards * alive).sum(1).mean(), seconds
 
 
 def theirs(steps, seed):

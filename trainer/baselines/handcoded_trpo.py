@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -124,7 +124,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
             acting = policy.snapshot(on_device=config.device != "cpu")
             batch = collector.collect(acting, config.batch)
             rewards = reward(batch.next_obs, batch.actions, batch.qpos, batch.next_qpos, batch.next_qvel)
-            stats = trpo.update(batch, rewards)
+            stats = trpo.update(replace(batch, rewards=rewards))
             bar.update(per_iteration)
             if iteration % config.evaluate_every == 0 or iteration == iterations:
                 episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)

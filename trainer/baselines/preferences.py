@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -167,7 +167,7 @@ def train_preferences(
         for iteration in range(1, iterations + 1):
             rollouts = collector.collect(policy.snapshot(), config.batch)
             rewards = reward.rewards(rollouts.obs, rollouts.actions)  # one reward for the whole batch
-            stats = trpo.update(rollouts, rewards)
+            stats = trpo.update(replace(rollouts, rewards=rewards))
             bar.update(per_iteration)
             steps = iteration * per_iteration
             correlation = agreement(rollouts, rewards, config.segment_steps)

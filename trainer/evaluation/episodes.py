@@ -1,7 +1,7 @@
 """What a trained policy is worth: 16 deterministic episodes, and how like the demo they are.
 
 Evaluation may read hidden demo states; nothing in ``onedemo.training.learner`` or
-``onedemo.training.trainer`` may.
+``onedemo.training.training_run`` may.
 
 Shapes: N episodes, T control steps, o = 11 observations, q = 6 positions.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from onedemo.annotators.oracle import Oracle, appearance
 from onedemo.evaluation.metrics import clean_turns, farthest_turn, landings, net_turns, turned
 from onedemo.evaluation.time_warping import align
+from onedemo.reward.episode_rules import mean_rating
 from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
@@ -23,8 +24,8 @@ from onedemo.sim.task_rewards import backflip_reward, hop_reward, until_fall
 
 EPISODES = 16
 ALIGN_SECONDS = 0.6
-"""How late or early the robot may be when it is laid along the demo; as far as an elastic clock goes by
-default (``practice.slack_seconds``), but the same for every method."""
+"""How late or early the robot may be when it is laid along the demo; as far as an adaptive phase goes
+by default (``practice.slack_seconds``), but the same for every method."""
 LEAST_IS_BEST = ("state_error",)
 """Figures whose best episode has the least."""
 
@@ -50,10 +51,6 @@ class Trained(Protocol):
         """How the demo phase moves in so many episodes."""
         ...
 
-    def frames_of(self, demo_steps: np.ndarray) -> np.ndarray:
-        """The demo frame on screen at control steps: same shape."""
-        ...
-
 
 def summarise(
     learner: Trained, snapshot: Snapshot | None, oracle: Oracle | None
@@ -66,16 +63,16 @@ def summarise(
         oracle: Knows the demo's hidden states; None leaves out what compares with them.
 
     Returns:
-        ``predicted_similarity`` (mean rating of a step, 1..5) and all of ``per_episode``; None where a
+        ``predicted_similarity`` (mean rating over the demo, 1..5) and all of ``per_episode``; None where a
         figure cannot be had.
     """
     episodes = perform(learner, snapshot)
-    figures = {"predicted_similarity": predicted_similarity(learner, snapshot, episodes)}
+    figures = {"predicted_similarity": predicted_similarity(episodes) if snapshot is not None else None}
     return {name: spread(name, values) for name, values in (figures | per_episode(episodes, oracle)).items()}
 
 
 def perform(learner: Trained, snapshot: Snapshot | None) -> Episodes:
-    """The 16 episodes of the current policy; the snapshot moves an elastic clock."""
+    """The 16 episodes of the current policy; the snapshot gives rewards and moves an adaptive phase."""
     rules = learner.rules(EPISODES, snapshot) if snapshot is not None else None
     return perform_policy(learner.policy(), env_name=learner.env, rules=rules)
 
@@ -87,14 +84,9 @@ def perform_policy(
     return evaluate(policy, env_name, episodes=EPISODES, seed=_SEED, rules=rules)
 
 
-def predicted_similarity(
-    learner: Trained, snapshot: Snapshot | None, episodes: Episodes
-) -> np.ndarray | None:
-    """Mean predicted rating of the steps of each episode, by its own clock, (N,)."""
-    if snapshot is None:
-        return None
-    frames = learner.frames_of(episodes.clock[:, :-1])
-    return snapshot.ratings(frames, episodes.obs[:, :-1], episodes.actions).mean(axis=-1)
+def predicted_similarity(episodes: Episodes) -> np.ndarray:
+    """Mean predicted rating of each episode over the demo steps it passed, from its rewards, (N,)."""
+    return mean_rating(episodes.rewards, np.diff(episodes.clock))
 
 
 def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarray | None]:

@@ -1,18 +1,21 @@
-"""How the policy practises: where episodes start, how the demo's clock moves, when one is given up.
+"""The episode rules of the method: where episodes start, how the demo phase moves, rewards, early ends.
 
-All three follow the current similarity predictor, and each can be switched off (``RolloutConfig``).
+All of them follow the current reward model. The reward of a step is the predicted similarity, 0..1, of the
+state *after* it to the demo there, times the demo steps that the phase moved on: ``r = s(c', x') (c' - c)``.
+Its sum is the similarity integrated over the demo, however long the robot takes. The state after the step is
+scored because that is what the action brought about. Each of the following can be switched off
+(``RolloutConfig.practice``); without them all, the rules are the paper's.
 
-- **Elastic clock.** After each control step the demo moves on by 0 to 3 steps, to where it looks most
-  like the robot, within a set time of the episode's own. The reward is similarity times steps moved:
-  ``r = s(c', x') (c' - c)``, whose sum is the similarity integrated over the demo, however long the robot
-  takes. With a fixed clock a robot that is a tenth of a second late is wrong from then on.
-- **Bank.** Of a large number of random states the predictor picks those most like each part of the
-  demo; a share of the episodes starts there. This is reference-state initialisation (Peng et al. 2018,
+- **Adaptive phase.** After each control step the demo moves on by 0 to 3 steps, to where it looks most
+  like the robot, within a set time of the episode's own. With a fixed phase a robot that is a tenth of a
+  second late is wrong from then on.
+- **Reset buffer.** Of a large number of random states the reward model picks those most like each part of
+  the demo; a share of the episodes starts there. This is reference-state initialisation (Peng et al. 2018,
   DeepMimic, section 6.2) where no reference states are known.
-- **Giving up.** An episode ends once the running mean of the similarity falls below a share of what
-  the predictor gives at best.
+- **Early termination.** An episode ends once the running mean of the similarity falls below a share of what
+  the reward model gives at best.
 
-Shapes: N lanes, C = 4 candidates, K restarting lanes, n states of the bank.
+Shapes: N lanes, T control steps, C = 4 candidates, K restarting lanes, n states of the reset buffer.
 """
 
 from __future__ import annotations
@@ -25,7 +28,8 @@ import numpy as np
 import torch
 
 from onedemo.reward.model import CLASSES, Snapshot
-from onedemo.rl.rollouts import EpisodeRules, Rollouts, Starts, Step
+from onedemo.rl.rollouts import EpisodeRules, Starts, Step, Transitions
+from onedemo.types import Rollouts
 
 _MOVES = np.arange(4)
 _MOVE_COST = 0.02
@@ -35,28 +39,28 @@ _FRESH = 0.6
 _MEMORY = 25.0
 """Control steps over which the running similarity is taken."""
 _GRACE = 10
-"""Control steps before an episode may be given up."""
-_BANK_EVERY = 20
-"""Control steps of the demo between entries of the bank."""
-_BANK_TRIES = 8000
+"""Control steps before an episode may end early."""
+_BUFFER_EVERY = 20
+"""Control steps of the demo between entries of the reset buffer."""
+_BUFFER_TRIES = 8000
 """Random states compared with each of them."""
-_BANK_KEPT = 12
+_BUFFER_KEPT = 12
 """Of these, the ones most like it are kept."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PracticeConfig:
-    """How the policy practises."""
+    """Which rules hold, and how far they go."""
 
     elastic: bool = True
-    """The demo's clock waits for the robot and hurries after it; False: it runs in real time."""
+    """The demo phase adapts to the robot; False: it runs in real time."""
     slack_seconds: float = 0.6
-    """How far the elastic clock may be from real time, either way."""
+    """How far the adaptive phase may be from real time, either way."""
     bank_share: float = 0.5
     """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
     give_up: float = 0.3
-    """An episode ends when the running similarity falls below this share of that of the bank's states,
-    the most that the predictor gives; 0: never."""
+    """An episode ends when the running similarity falls below this share of that of the reset buffer's
+    states, the most that the predictor gives; 0: never."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.bank_share <= 1:
@@ -66,14 +70,9 @@ class PracticeConfig:
         if self.slack_seconds < 0:
             raise ValueError(f"practice.slack_seconds must be at least 0, got {self.slack_seconds}")
 
-    @property
-    def plain(self) -> bool:
-        """Whether nothing of it follows the predictor step by step: the paper's practice."""
-        return not (self.elastic or self.bank_share or self.give_up)
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Bank:
+class ResetBuffer:
     """States to start from, each with the demo step it resembles."""
 
     qpos: np.ndarray
@@ -86,13 +85,13 @@ class Bank:
     """Of its states with the demo, as predicted, their mean, 0..1."""
 
 
-def fill_bank(
+def fill_reset_buffer(
     snapshot: Snapshot,
     states: Rollouts,
     frames_of: Callable[[np.ndarray], np.ndarray],
     demo_steps: int,
     rng: np.random.Generator,
-) -> Bank:
+) -> ResetBuffer:
     """Picks, for moments all over the demo, the states that the predictor rates best there.
 
     Args:
@@ -103,21 +102,21 @@ def fill_bank(
         rng: Draws the states that are tried.
     """
     flat = {name: getattr(states, name).reshape(-1, getattr(states, name).shape[-1]) for name in _STATE}
-    moments = np.arange(0, max(1, demo_steps - 2 * _BANK_EVERY), _BANK_EVERY)
+    moments = np.arange(0, max(1, demo_steps - 2 * _BUFFER_EVERY), _BUFFER_EVERY)
     kept, ratings = [], []
     for moment in moments:
-        tried = rng.integers(len(flat["obs"]), size=_BANK_TRIES)
+        tried = rng.integers(len(flat["obs"]), size=_BUFFER_TRIES)
         frame = frames_of(np.full(1, moment))
         liked = snapshot.ratings(frame, flat["obs"][tried], flat["actions"][tried])
-        best = np.argsort(-liked, kind="stable")[:_BANK_KEPT]
+        best = np.argsort(-liked, kind="stable")[:_BUFFER_KEPT]
         kept.append(tried[best])
         ratings.append(liked[best])
     chosen = np.concatenate(kept)
-    return Bank(
+    return ResetBuffer(
         qpos=flat["qpos"][chosen],
         qvel=flat["qvel"][chosen],
-        clock=np.repeat(moments, _BANK_KEPT).astype(np.int32),
-        similarity=float(_similarity(np.concatenate(ratings)).mean()),
+        clock=np.repeat(moments, _BUFFER_KEPT).astype(np.int32),
+        similarity=float(similarity(np.concatenate(ratings)).mean()),
     )
 
 
@@ -149,83 +148,96 @@ class PracticeRules(EpisodeRules):
         self._demo_steps = demo_steps
         self._frames_of = frames_of
         self._snapshot: Snapshot | None = None
-        self._bank: Bank | None = None
+        self._buffer: ResetBuffer | None = None
         self._threshold = config.give_up
+        # Else a batch is scored at once, when it is whole: that costs a tenth.
+        self._step_by_step = config.elastic or config.give_up > 0
         self._running = np.full(lanes, _FRESH)
         self._age = np.zeros(lanes, np.int64)
-        self._similar = np.zeros(lanes)
-        self._rewards: list[np.ndarray] = []
-        self.mean_similarity = 0.0
-        """Of the steps whose rewards were taken last, 0..1."""
-        self._similarities: list[float] = []
+        self._similar: list[np.ndarray] = []  # (N,) of each step of the batch so far
 
-    def use(self, snapshot: Snapshot, bank: Bank | None) -> None:
-        """From now on similarity is what this snapshot says, and episodes may start in this bank."""
-        self._snapshot, self._bank = snapshot, bank
-        self._threshold = self._config.give_up * (bank.similarity if bank is not None else 1.0)
-
-    def take_rewards(self) -> np.ndarray:
-        """Rewards of the steps since the last call, (N, T): similarity, 0..1, times steps moved."""
-        rewards, self._rewards = np.stack(self._rewards, axis=1), []
-        self.mean_similarity, self._similarities = float(np.mean(self._similarities)), []
-        return rewards
+    def use(self, snapshot: Snapshot, buffer: ResetBuffer | None) -> None:
+        """From now on similarity is what this snapshot says, and episodes may start in this reset buffer."""
+        self._snapshot, self._buffer = snapshot, buffer
+        self._threshold = self._config.give_up * (buffer.similarity if buffer is not None else 1.0)
 
     def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:
-        """States of the bank for a share of the lanes; the others stand."""
+        """States of the reset buffer for a share of the lanes; the others stand."""
         self._running[lanes], self._age[lanes] = _FRESH, 0
-        if self._bank is None:
+        if self._buffer is None:
             return None
         lanes = lanes[rng.random(len(lanes)) < self._config.bank_share]
-        chosen = rng.integers(len(self._bank.clock), size=len(lanes))
+        chosen = rng.integers(len(self._buffer.clock), size=len(lanes))
         return Starts(
             lanes=lanes,
-            qpos=self._bank.qpos[chosen],
-            qvel=self._bank.qvel[chosen],
-            clock=self._bank.clock[chosen],
+            qpos=self._buffer.qpos[chosen],
+            qvel=self._buffer.qvel[chosen],
+            clock=self._buffer.clock[chosen],
         )
 
     def advance(self, step: Step) -> np.ndarray:
-        """Where the demo is after the step; notes the reward."""
-        assert self._snapshot is not None, "use(snapshot) comes before practice"
+        """Where the demo is after the step."""
+        if not self._step_by_step:
+            return step.clock + 1
         if not self._config.elastic:
-            clock = step.clock + 1
-            self._similar = self._similarity(clock, step)
-            moved = np.ones(len(clock))
-        else:
-            moves = _MOVES[:, None]
-            candidates = step.clock + moves
-            similar = self._similarity(candidates, step)
-            too_far = (np.abs(candidates - step.elapsed) > self._slack) & (moves != 1)
-            value = np.where(too_far, -np.inf, similar - _MOVE_COST * np.abs(moves - 1))
-            moved = value.argmax(axis=0)
-            clock = step.clock + moved
-            self._similar = np.take_along_axis(similar, moved[None], axis=0)[0]
-        self._rewards.append(self._similar * moved)
-        self._similarities.append(float(self._similar.mean()))
-        return clock
+            self._similar.append(self._similarity(step.clock + 1, step.next_obs, step.actions))
+            return step.clock + 1
+        moves = _MOVES[:, None]
+        candidates = step.clock + moves
+        similar = self._similarity(candidates, step.next_obs, step.actions)
+        too_far = (np.abs(candidates - step.elapsed) > self._slack) & (moves != 1)
+        value = np.where(too_far, -np.inf, similar - _MOVE_COST * np.abs(moves - 1))
+        moved = value.argmax(axis=0)
+        self._similar.append(np.take_along_axis(similar, moved[None], axis=0)[0])
+        return step.clock + moved
 
     def stop(self, step: Step, next_clock: np.ndarray) -> np.ndarray:
         """True where the robot has been unlike the demo for a while."""
-        self._running += (self._similar - self._running) / _MEMORY
-        self._age += 1  # not ``elapsed``, which begins in the middle of the demo with a state of the bank
+        if not self._config.give_up:
+            return super().stop(step, next_clock)
+        self._running += (self._similar[-1] - self._running) / _MEMORY
+        self._age += 1  # not ``elapsed``, which begins in the middle of the demo with a state of the buffer
         return (self._running < self._threshold) & (self._age > _GRACE)
 
+    def score(self, batch: Transitions) -> np.ndarray:
+        """Rewards of the steps since the last call: similarity, 0..1, times demo steps moved, (N, T)."""
+        if self._step_by_step:
+            similar, self._similar = np.stack(self._similar, axis=1), []
+        else:
+            similar = self._similarity(batch.next_clock, batch.next_obs, batch.actions)
+        return similar * (batch.next_clock - batch.clock)
+
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed practice needs besides snapshot and bank."""
+        """What a resumed training needs besides snapshot and reset buffer; nothing without early ends."""
+        if not self._config.give_up:
+            return {}
         return {"running": torch.from_numpy(self._running.copy()), "age": torch.from_numpy(self._age.copy())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on where ``state_dict`` was taken."""
-        self._running, self._age = state["running"].numpy().copy(), state["age"].numpy().copy()
+        if state:
+            self._running, self._age = state["running"].numpy().copy(), state["age"].numpy().copy()
 
-    def _similarity(self, clock: np.ndarray, step: Step) -> np.ndarray:
+    def _similarity(self, clock: np.ndarray, next_obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """0..1, the shape of ``clock``: states after the step against the demo there."""
-        assert self._snapshot is not None
+        assert self._snapshot is not None, "use(snapshot) comes before the first step"
         frames = self._frames_of(np.minimum(clock, self._demo_steps - 1))
-        ratings = self._snapshot.ratings(frames, step.next_obs, step.actions)
-        return _similarity(ratings)
+        return similarity(self._snapshot.ratings(frames, next_obs, actions))
 
 
-def _similarity(ratings: np.ndarray) -> np.ndarray:
+def similarity(ratings: np.ndarray) -> np.ndarray:
     """Ratings 1..5 as 0..1."""
     return np.clip((ratings - 1) / (CLASSES - 1), 0, 1)
+
+
+def mean_rating(rewards: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """The predicted rating, 1..5, behind rewards of ``PracticeRules``: the mean over the demo steps passed.
+
+    Args:
+        rewards: Of each step, (..., T).
+        moved: Demo steps passed in each, (..., T).
+
+    Returns:
+        (...); 1 where the demo did not move at all.
+    """
+    return 1 + (CLASSES - 1) * rewards.sum(axis=-1) / np.maximum(moved.sum(axis=-1), 1)

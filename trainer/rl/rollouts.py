@@ -1,8 +1,8 @@
 """Collecting what the policy does: batches for learning, whole episodes for evaluation.
 
 ``Collector`` keeps its lanes running between iterations, so a batch may be shorter than an
-episode. ``EpisodeRules`` says how episodes start, how the demo clock moves and when an episode
-ends early; the class itself is the plain case; subclass it for another.
+episode. ``EpisodeRules`` says how episodes start, how the demo phase moves, what a step is worth and
+when an episode ends early; the class itself is the plain case; subclass it for another.
 
 Shapes: N lanes, T control steps, o observations, a actions, q = v positions and velocities,
 f policy inputs, K lanes that restart.
@@ -10,7 +10,7 @@ f policy inputs, K lanes that restart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -49,13 +49,13 @@ class Episodes:
     """(N, T + 1, v)."""
     clock: np.ndarray
     """Demo step of each state, (N, T + 1)."""
-    env_rewards: np.ndarray
-    """The environment's own reward of each step, (N, T)."""
+    rewards: np.ndarray
+    """What each step was worth, as the rules say, (N, T)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Step:
-    """One control step of all lanes, as the rules see it."""
+    """One control step of all lanes, as the environment made it."""
 
     obs: np.ndarray
     """Before the step, (N, o)."""
@@ -72,6 +72,12 @@ class Step:
     """(N, q)."""
     next_qvel: np.ndarray
     """(N, v)."""
+    rewards: np.ndarray
+    """The environment's own, (N,)."""
+    terminated: np.ndarray
+    """Whether the environment ended the episode with it, (N,)."""
+    truncated: np.ndarray
+    """Whether it ended at the environment's time limit, (N,)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -89,7 +95,7 @@ class Starts:
 
 
 class EpisodeRules:
-    """The plain rules: a standing start, one demo step per control step, no early end."""
+    """The plain rules: a standing start, one demo step per control step, no early end, the given rewards."""
 
     def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:
         """Called when lanes restart; None leaves them all in the standard reset.
@@ -105,8 +111,12 @@ class EpisodeRules:
         return step.clock + 1
 
     def stop(self, step: Step, next_clock: np.ndarray) -> np.ndarray:
-        """True where the episode is given up, as a terminal state, (N,)."""
+        """True where the episode ends early, as in a terminal state, (N,)."""
         return np.zeros(len(step.clock), bool)
+
+    def score(self, batch: Transitions) -> np.ndarray:
+        """Rewards of a batch, (N, T), once it is whole; its own are those of the environment."""
+        return batch.rewards
 
     def state_dict(self) -> dict[str, Any]:
         """What a resumed training needs of the rules, for ``torch.save``."""
@@ -186,7 +196,7 @@ class Collector:
         }
         deeds = {
             "actions": room(steps, size.action_size, dtype=np.float32),
-            "env_rewards": room(steps),
+            "rewards": room(steps),
             "terminated": room(steps, dtype=bool),
             "truncated": room(steps, dtype=bool),
         }
@@ -214,7 +224,8 @@ class Collector:
                 rows[steps_K, lanes_K] = ends[name]
         columns = {name: rows[:-1] for name, rows in states.items()} | deeds
         columns |= {f"next_{name}": rows for name, rows in after.items()}
-        return Transitions(**{name: rows.swapaxes(0, 1) for name, rows in columns.items()})
+        batch = Transitions(**{name: rows.swapaxes(0, 1) for name, rows in columns.items()})
+        return replace(batch, rewards=self.rules.score(batch))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed training needs, as tensors and plain numbers."""
@@ -244,24 +255,12 @@ class Collector:
         self, actions: np.ndarray
     ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, dict[str, np.ndarray]] | None]:
         """One control step: what it brought, and the last states of the lanes that ended, if any did."""
-        env, clock = self.env, self._clock
-        elapsed = env.elapsed + 1
-        before, (self._obs, env_rewards, terminated, truncated, infos) = self._obs, env.step(actions)
-        step = Step(
-            obs=before,
-            actions=actions,
-            clock=clock,
-            elapsed=elapsed,
-            next_obs=infos.get("final_obs", self._obs),
-            next_qpos=infos["final_qpos"] if infos else env.qpos,
-            next_qvel=infos["final_qvel"] if infos else env.qvel,
-        )
-        next_clock = self.rules.advance(step).astype(np.int32)
-        already = terminated | truncated
-        terminated = terminated | (self.rules.stop(step, next_clock) & ~already)
-        truncated = (truncated | (next_clock >= env.horizon)) & ~terminated
+        step, next_clock = take_step(self.env, self._obs, self._clock, actions, self.rules)
+        already = step.terminated | step.truncated
+        terminated = step.terminated | (self.rules.stop(step, next_clock) & ~already)
+        truncated = (step.truncated | (next_clock >= self.env.horizon)) & ~terminated
         ended = terminated | truncated
-        self._clock = np.where(ended, 0, next_clock).astype(np.int32)
+        self._obs, self._clock = step.next_obs, np.where(ended, 0, next_clock).astype(np.int32)
         last = None
         if ended.any():
             lanes = np.flatnonzero(ended)
@@ -269,10 +268,10 @@ class Collector:
             last = lanes, {name: value[lanes] for name, value in ends.items()}
             late = ended & ~already  # ended by the rules, not by the environment
             if late.any():
-                env.reset(options={"reset_mask": late})
+                self.env.reset(options={"reset_mask": late})
             self._begin(lanes)
         outcome = {
-            "actions": actions, "env_rewards": env_rewards, "terminated": terminated, "truncated": truncated,
+            "actions": actions, "rewards": step.rewards, "terminated": terminated, "truncated": truncated,
         }  # fmt: skip
         return outcome, last
 
@@ -284,9 +283,57 @@ class Collector:
         self._obs = self.env.obs
 
 
+def take_step(
+    env: vector_env.HopperVectorEnv,
+    obs: np.ndarray,
+    clock: np.ndarray,
+    actions: np.ndarray,
+    rules: EpisodeRules,
+) -> tuple[Step, np.ndarray]:
+    """One control step of all lanes: what happened, and the demo step after it, (N,), int32.
+
+    Args:
+        env: The lanes; those that end with the step have been reset afterwards.
+        obs: What they show, (N, o).
+        clock: Demo step of each, (N,).
+        actions: As sampled, (N, a).
+        rules: Move the demo phase.
+    """
+    elapsed = env.elapsed + 1
+    next_obs, rewards, terminated, truncated, infos = env.step(actions)
+    step = Step(
+        obs=obs,
+        actions=actions,
+        clock=clock,
+        elapsed=elapsed,
+        next_obs=infos.get("final_obs", next_obs),
+        next_qpos=infos["final_qpos"] if infos else env.qpos,
+        next_qvel=infos["final_qvel"] if infos else env.qvel,
+        rewards=rewards,
+        terminated=terminated,
+        truncated=truncated,
+    )
+    return step, rules.advance(step).astype(np.int32)
+
+
+class WholeEpisodes(EpisodeRules):
+    """Other rules without their starts and early ends; the phase stays at the horizon once it gets there."""
+
+    def __init__(self, rules: EpisodeRules, horizon: int) -> None:
+        self._rules, self._horizon = rules, horizon
+
+    def advance(self, step: Step) -> np.ndarray:
+        """As the other rules move it, up to the horizon."""
+        return np.minimum(self._rules.advance(step), self._horizon)
+
+    def score(self, batch: Transitions) -> np.ndarray:
+        """As the other rules do."""
+        return self._rules.score(batch)
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Acting:
-    """A policy that never changes and the rules that move the demo beside it, for evaluation and for the eye.
+    """A policy that never changes and the rules that move the demo beside it, for the live view.
 
     Rules note what happens, so each user has an object of its own.
     """
@@ -294,37 +341,20 @@ class Acting:
     policy: PolicySnapshot
     """Acts."""
     rules: EpisodeRules
-    """Move the demo's clock; their starts and stops are not used."""
+    """Move the demo phase; their starts and early ends are not used."""
 
     def step(
-        self, env: vector_env.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray, elapsed: int,
-        rng: np.random.Generator | None = None,
-    ) -> tuple[Step, np.ndarray, np.ndarray]:  # fmt: skip
-        """One control step of all lanes, none of which may end with it.
+        self, env: vector_env.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray
+    ) -> tuple[Step, np.ndarray]:
+        """One control step of all lanes by the policy's mean action, and the demo step after it, (N,).
 
         Args:
-            env: The lanes.
+            env: The lanes, none of which may end with the step.
             obs: What they show, (N, o).
             clock: Demo step of each, (N,).
-            elapsed: Control steps since they began, before this one.
-            rng: Samples the action; None takes its mean.
-
-        Returns:
-            The step, the environment's rewards (N,), and the demo step after it (N,), which stays at the
-            policy's horizon once it gets there.
         """
-        actions = self.policy.act(self.policy.inputs(obs, clock), rng)
-        next_obs, rewards, _, _, _ = env.step(actions)
-        step = Step(
-            obs=obs,
-            actions=actions,
-            clock=clock,
-            elapsed=np.full(len(clock), elapsed + 1, np.int32),
-            next_obs=next_obs,
-            next_qpos=env.qpos,
-            next_qvel=env.qvel,
-        )
-        return step, rewards, np.minimum(self.rules.advance(step), self.policy.horizon).astype(np.int32)
+        actions = self.policy.act(self.policy.inputs(obs, clock))
+        return take_step(env, obs, clock, actions, WholeEpisodes(self.rules, self.policy.horizon))
 
 
 def evaluate(
@@ -346,8 +376,7 @@ def evaluate(
         episodes: N.
         seed: Of the starts (and of the noise, if not deterministic).
         horizon: T; the policy's own horizon if None.
-        rules: Moves the demo clock; its starts and stops are not used. The clock stays at the
-            horizon once it gets there.
+        rules: Move the demo phase and give the rewards, as ``WholeEpisodes``.
         deterministic: Take the mean action.
         nthread: Physics threads.
 
@@ -358,27 +387,19 @@ def evaluate(
         UserError: If the environment is unknown.
     """
     horizon = policy.horizon if horizon is None else horizon
-    acting = Acting(policy=policy, rules=rules or EpisodeRules())
-    # One step more than asked, so that the last state is seen before the restart.
-    env = vector_env.make(env_name, episodes, horizon=horizon + 1, nthread=nthread)
-    rng = None if deterministic else np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
-    obs, _ = env.reset(seed=seed)
-    clock = np.zeros(episodes, np.int32)
-    states = [(obs, env.qpos, env.qvel, clock)]
-    actions, rewards = [], []
-    for t in range(horizon):
-        step, reward, clock = acting.step(env, obs, clock, t, rng)
-        obs = step.next_obs
-        states.append((obs, step.next_qpos, step.next_qvel, clock))
-        actions.append(step.actions)
-        rewards.append(reward)
+    # One step more than there will be, so that neither time nor the demo phase ends an episode.
+    env = vector_env.make(env_name, episodes, horizon=max(horizon, policy.horizon) + 1, nthread=nthread)
+    whole = WholeEpisodes(rules or EpisodeRules(), policy.horizon)
+    collector = Collector(env, seed=seed, rules=whole, stagger=False)
+    batch = collector.collect(policy, horizon, deterministic=deterministic)
     env.close()
-    columns = [np.stack(column, axis=1) for column in zip(*states, strict=True)]
+
+    def with_last(name: str) -> np.ndarray:
+        states, after = getattr(batch, name), getattr(batch, f"next_{name}")
+        return np.ascontiguousarray(np.concatenate([states, after[:, -1:]], axis=1))
+
     return Episodes(
-        obs=columns[0],
-        qpos=columns[1],
-        qvel=columns[2],
-        clock=columns[3],
-        actions=np.stack(actions, axis=1),
-        env_rewards=np.stack(rewards, axis=1),
+        **{name: with_last(name) for name in ("obs", "qpos", "qvel", "clock")},
+        actions=np.ascontiguousarray(batch.actions),
+        rewards=np.ascontiguousarray(batch.rewards),
     )

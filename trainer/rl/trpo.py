@@ -126,12 +126,11 @@ class Trpo:
         self._beside = ThreadPoolExecutor(1, "value", _one_thread) if threads > 1 else None
         self._generator = torch.Generator().manual_seed(seed)
 
-    def update(self, rollouts: Rollouts, rewards_NT: np.ndarray, *, progress: float = 0.0) -> TrpoStats:
+    def update(self, rollouts: Rollouts, *, progress: float = 0.0) -> TrpoStats:
         """One TRPO step, then the value regression, then the policy's input normaliser.
 
         Args:
-            rollouts: What the current policy did.
-            rewards_NT: Reward of each step, (N, T), any units.
+            rollouts: What the current policy did, with the reward of each step in any units.
             progress: How much of the training is over, 0..1; it moves the radius to ``final_kl``.
 
         Returns:
@@ -140,6 +139,7 @@ class Trpo:
         Raises:
             ValueError: If the rewards have the wrong shape or are not finite.
         """
+        rewards_NT = rollouts.rewards
         if rewards_NT.shape != rollouts.clock.shape or not np.isfinite(rewards_NT).all():
             raise ValueError(f"rewards must be finite and {rollouts.clock.shape}, got {rewards_NT.shape}")
         final_kl = min(self.config.final_kl, self.config.max_kl)

@@ -3,8 +3,7 @@
 An episode lasts longer than an iteration, so lanes are followed from one to the next. Only positions are
 kept (some KB an iteration); pictures and videos are drawn when somebody asks.
 
-Shapes: N lanes, T control steps of an iteration, S of them that are rated, L steps of an episode,
-q = 6 positions.
+Shapes: N lanes, T control steps of an iteration, L steps of an episode, q = 6 positions.
 """
 
 from __future__ import annotations
@@ -23,13 +22,12 @@ from onedemo.demos.library import read_frames
 from onedemo.demos.video import write_webm
 from onedemo.render.clip_image import side_by_side
 from onedemo.render.renderer import Renderer, RenderThread
-from onedemo.reward.model import Snapshot
-from onedemo.types import Demo, Rollouts
+from onedemo.reward.episode_rules import mean_rating
+from onedemo.rl.rollouts import Transitions
+from onedemo.types import Demo
 
 PARTS = 40
 """Of the demo, each with a mean rating."""
-_EVERY = 5
-"""Control steps between those that are rated for this."""
 _SHOWN = 6
 _WIDTH, _HEIGHT = 160, 120
 _QUALITY = 82
@@ -37,21 +35,23 @@ _AT_ONCE = 30
 """Pictures in memory while a video is drawn: each is half a megabyte."""
 
 
-def by_part(clock: np.ndarray, ratings: np.ndarray, demo_steps: int) -> list[float | None]:
-    """Where in the demo it is rated how.
+def by_part(rollouts: Transitions, demo_steps: int) -> list[float | None]:
+    """Where in the demo the rollouts are rated how.
 
     Args:
-        clock: Demo steps, (N, S).
-        ratings: Predicted there, (N, S).
+        rollouts: With rewards of ``PracticeRules``, (N, T).
         demo_steps: Control steps of the demo.
 
     Returns:
-        The mean in each of ``PARTS`` parts of the demo; None where nobody was.
+        The mean rating in each of ``PARTS`` parts of the demo; None where nobody was.
     """
-    part = np.minimum(clock * PARTS // demo_steps, PARTS - 1).ravel()
-    counts = np.bincount(part, minlength=PARTS)
-    sums = np.bincount(part, weights=ratings.ravel(), minlength=PARTS)
-    return [round(float(s / n), 3) if n else None for s, n in zip(sums, counts, strict=True)]
+    moved = rollouts.next_clock - rollouts.clock
+    part = np.minimum(rollouts.next_clock, demo_steps - 1) * PARTS // demo_steps
+    rewards, steps = (
+        np.bincount(part.ravel(), weights=x.ravel(), minlength=PARTS) for x in (rollouts.rewards, moved)
+    )
+    ratings = mean_rating(rewards[:, None], steps[:, None])
+    return [round(float(rating), 3) if n else None for rating, n in zip(ratings, steps, strict=True)]
 
 
 class Episode(NamedTuple):
@@ -61,13 +61,15 @@ class Episode(NamedTuple):
     """(L, q), float32."""
     clock: np.ndarray
     """Demo step at each, (L,)."""
-    ratings: np.ndarray
-    """Predicted, at every fifth step or so."""
+    rewards: np.ndarray
+    """Of each step, (L,)."""
+    moved: np.ndarray
+    """Demo steps passed in each, (L,)."""
 
     @property
     def worth(self) -> float:
-        """What it is compared by: long and good is better than good and soon over."""
-        return float((self.ratings - 1).sum())
+        """What it is compared by, its return: long and good is better than good and soon over."""
+        return float(self.rewards.sum())
 
 
 class Lanes:
@@ -76,29 +78,29 @@ class Lanes:
     def __init__(self) -> None:
         self._open: dict[int, list[Episode]] = {}
 
-    def ended(self, rollouts: Rollouts, ratings: np.ndarray) -> list[Episode]:
-        """The episodes that ended in an iteration and whose beginning was seen.
-
-        Args:
-            rollouts: The iteration, (N, T).
-            ratings: Predicted at every ``_EVERY``-th of its steps, (N, S).
-        """
+    def ended(self, rollouts: Transitions) -> list[Episode]:
+        """The episodes that ended in an iteration, (N, T), and whose beginning was seen."""
         whole = []
+        moved = rollouts.next_clock - rollouts.clock
         for lane, ends in enumerate(rollouts.terminated | rollouts.truncated):
             edges = [0, *(np.flatnonzero(ends) + 1).tolist(), len(ends)]
             for start, stop in itertools.pairwise(edges):
                 if start > 0:
                     self._open[lane] = []
-                if lane not in self._open:
-                    continue  # it had begun before anybody looked
-                rated = slice(-(-start // _EVERY), -(-stop // _EVERY))
-                qpos = rollouts.qpos[lane, start:stop].astype(np.float32)
+                if start == stop or lane not in self._open:
+                    continue  # nothing of it yet; or it had begun before anybody looked
+                cut = (lane, slice(start, stop))
                 parts = self._open[lane]
-                parts.append(Episode(qpos, rollouts.clock[lane, start:stop].copy(), ratings[lane, rated]))
+                parts.append(
+                    Episode(
+                        rollouts.qpos[cut].astype(np.float32),
+                        *(x[cut].copy() for x in (rollouts.clock, rollouts.rewards, moved)),
+                    )
+                )
                 if stop > 0 and ends[stop - 1]:
                     whole.append(Episode(*map(np.concatenate, zip(*parts, strict=True))))
                     parts.clear()
-        return [episode for episode in whole if len(episode.ratings)]
+        return whole
 
 
 class Gallery:
@@ -116,29 +118,25 @@ class Gallery:
         self._lanes = Lanes()
 
     def note(
-        self, iteration: int, snapshot: Snapshot, rollouts: Rollouts,
-        frames_of: Callable[[np.ndarray], np.ndarray], demo_steps: int,
+        self, iteration: int, rollouts: Transitions, frames_of: Callable[[np.ndarray], np.ndarray],
+        demo_steps: int,
     ) -> dict[str, Any]:  # fmt: skip
         """Looks at what was done in an iteration, and keeps the best whole episode that ended in it.
 
         Args:
             iteration: Its number.
-            snapshot: Rates.
-            rollouts: What was done, (N, T).
+            rollouts: What was done, with rewards of ``PracticeRules``, (N, T).
             frames_of: Demo frame at control steps.
             demo_steps: Control steps of the demo.
 
         Returns:
             "timeline" as ``by_part``; and "best", the episode's mean predicted rating, if one ended.
         """
-        some = (slice(None), slice(None, None, _EVERY))
-        clock = rollouts.clock[some]
-        ratings = snapshot.ratings(frames_of(clock), rollouts.obs[some], rollouts.actions[some])
-        told: dict[str, Any] = {"timeline": by_part(clock, ratings, demo_steps)}
-        if whole := self._lanes.ended(rollouts, ratings):
+        told: dict[str, Any] = {"timeline": by_part(rollouts, demo_steps)}
+        if whole := self._lanes.ended(rollouts):
             best = max(whole, key=lambda episode: episode.worth)
             self.keep(iteration, best.qpos, frames_of(best.clock))
-            told["best"] = float(best.ratings.mean())
+            told["best"] = float(mean_rating(best.rewards, best.moved))
         return told
 
     def keep(self, iteration: int, qpos: np.ndarray, frames: np.ndarray) -> None:

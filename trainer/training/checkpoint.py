@@ -71,4 +71,6 @@ def _pack(pool: Rollouts) -> dict[str, torch.Tensor]:
 
 
 def _unpack(packed: dict[str, torch.Tensor]) -> Rollouts:
+    if "env_rewards" in packed:  # as rewards were called in 0.1.0
+        packed["rewards"] = packed.pop("env_rewards")
     return Rollouts(**{name: value.numpy().swapaxes(0, 1) for name, value in packed.items()})

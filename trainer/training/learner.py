@@ -18,7 +18,7 @@ from onedemo.config import RunConfig
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.errors import UserError
 from onedemo.queries.selection import Question, choose
-from onedemo.reward.episode_rules import PracticeRules, fill_bank
+from onedemo.reward.episode_rules import PracticeRules, ResetBuffer, fill_reset_buffer, mean_rating
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
 from onedemo.rl.policy import Policy, PolicySnapshot, check_device
@@ -78,7 +78,8 @@ class Learner:
         self._collector = self._make_collector(
             config.rollouts.lanes, seed=config.seed, stagger=True, rules=self._rules
         )
-        self._banked = 0  # number of the snapshot that chose the present bank
+        self._buffer: ResetBuffer | None = None
+        self._buffer_of = 0  # number of the snapshot that filled it
         self._wild: Transitions | None = None
 
     def look_at(self, features: np.ndarray, track: Track | None = None) -> None:
@@ -127,7 +128,7 @@ class Learner:
         """
         config = self.config
         if config.ratings.starts == "random":
-            return self._wild_rollouts()  # the bank picks from the same
+            return self._wild_rollouts()  # the reset buffer picks from the same
         collector = self._make_collector(_RANDOM_LANES, seed=config.seed + 1, stagger=False)
         return collector.collect(self._make_policy().snapshot(), self.demo_steps)
 
@@ -196,20 +197,13 @@ class Learner:
         left = -(-(sizes.total_steps - self.env_steps) // sizes.lanes)
         steps = max(1, min(sizes.steps, left))
         policy = self._policy.snapshot(on_device=self._acts_on_device)
-        if isinstance(self._rules, PracticeRules):
-            self._use(snapshot, self._rules)
-            rollouts = self._collector.collect(policy, steps)
-            rewards = self._rules.take_rewards()
-            predicted = 1 + 4 * self._rules.mean_similarity
-        else:
-            rollouts = self._collector.collect(policy, steps)
-            rewards = snapshot.ratings(self.frames_of(rollouts.clock), rollouts.obs, rollouts.actions)
-            predicted = float(rewards.mean())
-        progress = min(1.0, self.env_steps / sizes.total_steps)
-        stats = self._trpo.update(rollouts, rewards, progress=progress)
+        self._use(snapshot)
+        rollouts = self._collector.collect(policy, steps)
+        predicted = mean_rating(rollouts.rewards.ravel(), (rollouts.next_clock - rollouts.clock).ravel())
+        stats = self._trpo.update(rollouts, progress=min(1.0, self.env_steps / sizes.total_steps))
         self.iteration += 1
         self.env_steps += rollouts.clock.size
-        return rollouts, {"predicted": predicted, **asdict(stats)}
+        return rollouts, {"predicted": float(predicted), **asdict(stats)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs besides config, demo and ratings, for ``torch.save``."""
@@ -231,33 +225,33 @@ class Learner:
         self._collector.load_state_dict(state["collector"])
         self._rules.load_state_dict(state.get("rules", {}))
 
-    def rules(self, lanes: int, snapshot: Snapshot | None = None) -> EpisodeRules:
-        """How the demo's clock moves in episodes of so many lanes; for evaluation and for the live view.
+    def rules(self, lanes: int, snapshot: Snapshot | None = None) -> PracticeRules:
+        """The run's rules for episodes of so many lanes; for evaluation and for the live view.
 
         Args:
             lanes: N.
-            snapshot: What similarity is; needed before the rules of an elastic clock can be used.
+            snapshot: What similarity is; needed before the rules can be used.
         """
-        practice = self.config.practice
-        if practice.plain:
-            return EpisodeRules()
         rules = PracticeRules(
-            practice, lanes=lanes, dt=self.dt, demo_steps=self.demo_steps, frames_of=self.frames_of
+            self.config.practice,
+            lanes=lanes,
+            dt=self.dt,
+            demo_steps=self.demo_steps,
+            frames_of=self.frames_of,
         )
         if snapshot is not None:
             rules.use(snapshot, None)
         return rules
 
-    def _use(self, snapshot: Snapshot, rules: PracticeRules) -> None:
-        """Lets practice follow a snapshot; a new one chooses a new bank, the same after a resume."""
-        if snapshot.number == self._banked:
-            return
-        bank = None
-        if self.config.practice.bank_share or self.config.practice.give_up:
+    def _use(self, snapshot: Snapshot) -> None:
+        """Lets rollouts follow a snapshot; a new one fills a new reset buffer, the same after a resume."""
+        practice = self.config.practice
+        if snapshot.number != self._buffer_of and (practice.bank_share or practice.give_up):
             rng = np.random.default_rng([self.config.seed, snapshot.number])
-            bank = fill_bank(snapshot, self._wild_rollouts(), self.frames_of, self.demo_steps, rng)
-        rules.use(snapshot, bank)
-        self._banked = snapshot.number
+            wild = self._wild_rollouts()
+            self._buffer = fill_reset_buffer(snapshot, wild, self.frames_of, self.demo_steps, rng)
+            self._buffer_of = snapshot.number
+        self._rules.use(snapshot, self._buffer)
 
     def _lens(self, features: np.ndarray) -> Lens:
         """The start's own, so that its weights mean the same; else one for this demo."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from onedemo.annotators.oracle import Oracle, make_rater, marker
@@ -20,7 +20,7 @@ from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run, find_run, program_version
-from onedemo.training.trainer import Trainer
+from onedemo.training.training_run import TrainingRun
 from onedemo.types import Demo
 from onedemo.vision.encoders import Encoder
 
@@ -68,20 +68,21 @@ def train(
     simulated = make_rater(rater, hidden, demo=demo, budget=budget, given=given, seed=config.seed)
     found = find_run(store, data_dir, demo, name=name, wanted=config) if name else None
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
-    trainer = Trainer(
+    training = TrainingRun(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder,
         simulated=Simulated(name=rater, rate=simulated.rate, mark=marker(simulated)),
         cache_dir=cache_dir, watch=watch, start=start,
     )  # fmt: skip
+    threads = torch.get_num_threads()
     try:
-        with hold(trainer.files.lock):
-            failure = _work(trainer, config.rollouts.total_steps, progress)
+        with hold(training.files.lock):
+            _work(training, progress)
     finally:
         simulated.close()
-    if failure is not None:
-        raise failure
+        torch.set_num_threads(threads)
     practised = time.monotonic() - began
-    learner, snapshot = trainer.final_policy()
+    learner, snapshot = training.learner, training.snapshot
+    assert learner is not None
     oracle = Oracle(hidden, budget=0) if hidden is not None else None
     by_class = store.ratings_by_class(run)
     return {
@@ -111,22 +112,13 @@ def chance(config: RunConfig, rater: str) -> str:
     return ""
 
 
-def _work(trainer: Trainer, total_steps: int, progress: bool) -> BaseException | None:
-    """Runs the trainer in its thread while this one shows how far it is."""
-    failures: list[BaseException] = []
-
-    def work() -> None:
-        try:
-            trainer.work()
-        except BaseException as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=work, name="trainer", daemon=True)
-    thread.start()
-    with tqdm(total=total_steps, unit="step", unit_scale=True, disable=not progress) as bar:
-        while thread.is_alive():
-            thread.join(0.25)
-            status = trainer.status()
-            bar.set_postfix_str(f"{status.phase}, {status.ratings} ratings, snapshot {status.snapshot}")
-            bar.update(min(status.env_steps, total_steps) - bar.n)
-    return failures[0] if failures else None
+def _work(training: TrainingRun, progress: bool) -> None:
+    """The whole run, with a bar that shows how far it is."""
+    total = training.config.rollouts.total_steps
+    with tqdm(total=total, unit="step", unit_scale=True, disable=not progress) as bar:
+        bar.set_postfix_str("starting")
+        training.prepare()
+        while (phase := training.step()) != "done":
+            snapshot = training.snapshot.number if training.snapshot is not None else 0
+            bar.set_postfix_str(f"{phase}, {training.queue.given()} ratings, snapshot {snapshot}")
+            bar.update(min(training.env_steps, total) - bar.n)

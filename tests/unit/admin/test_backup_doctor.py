@@ -34,7 +34,7 @@ from onedemo.reward.model import Snapshot
 from onedemo.storage.store import FILE_NAME, Store
 from onedemo.training.rating_queue import Simulated
 from unit.demos.test_library import make_video
-from unit.training.test_trainer import headless, make_trainer
+from unit.training.test_trainer import headless, make_run, work
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
 
@@ -89,9 +89,9 @@ def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
         with closing(Store(directory)) as store:
             run = store.runs()[0]["id"]
             rate = Simulated(name="rule", rate=lambda segment, step: 3)
-            trainer = make_trainer(store, demo, rate, small_config(), name=run)
-            trainer.work()
-            ends.append((trainer.status().snapshot, store.iterations(run)[-1]["predicted"]))
+            training = make_run(store, demo, rate, small_config(), name=run)
+            work(training)
+            ends.append((training.snapshot.number, store.iterations(run)[-1]["predicted"]))
     assert ends[0] == ends[1] and ends[0][0] > 0
 
 
@@ -136,7 +136,7 @@ def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir
 
         def go_on():
             rate = Simulated(name="rule", rate=lambda segment, step: 3)
-            make_trainer(store, demo, rate, small_config(), name=run).work()
+            work(make_run(store, demo, rate, small_config(), name=run))
             rows = store.iterations(run)
             return [{key: row[key] for key in row.keys() - {"steps_per_s"}} for row in rows]
 

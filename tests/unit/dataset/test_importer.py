@@ -18,7 +18,7 @@ from onedemo.storage.store import RATING_COLUMNS, Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
-from onedemo.training.trainer import Trainer
+from onedemo.training.training_run import TrainingRun
 
 
 def by_rule(segment, demo_step):
@@ -38,10 +38,13 @@ def study(tmp_path_factory):
     with closing(Store(data_dir)) as store:
         config = small_config()
         run = add_run(store, data_dir, demo, config, name="first")
-        Trainer(
+        training = TrainingRun(
             store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=Thumbnail(),
             simulated=Simulated(name="rule", rate=by_rule, mark=marks),
-        ).work()  # fmt: skip
+        )  # fmt: skip
+        training.prepare()
+        while training.step() != "done":
+            pass
         ada, bob = store.ensure_rater("Ada", "researcher"), store.ensure_rater("@Bob | co", "annotator")
         first = next(clip for clip, _ in store.rated_clips()).id
         store.rate(first, bob.id, 5, 1200)

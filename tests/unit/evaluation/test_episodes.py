@@ -27,7 +27,7 @@ def as_episodes(*hidden):
     }
     steps = columns["actions"].shape[1]
     clock = np.tile(np.arange(steps + 1), (len(hidden), 1))
-    return Episodes(**columns, clock=clock, env_rewards=np.zeros((len(hidden), steps)))
+    return Episodes(**columns, clock=clock, rewards=np.zeros((len(hidden), steps)))
 
 
 def test_the_demo_itself_has_the_best_of_everything(clean):

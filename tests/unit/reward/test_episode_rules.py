@@ -1,13 +1,20 @@
-"""Clock, bank and giving up, under a predictor whose ratings are known."""
+"""Adaptive phase, reset buffer, rewards and early termination, under a predictor whose ratings are known."""
 
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from onedemo.reward.episode_rules import Bank, PracticeConfig, PracticeRules, fill_bank
+from onedemo.reward.episode_rules import (
+    PracticeConfig,
+    PracticeRules,
+    ResetBuffer,
+    fill_reset_buffer,
+    mean_rating,
+)
 from onedemo.reward.model import PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.random_states import wild_rollouts
@@ -40,11 +47,11 @@ class Places(Snapshot):
         return {}
 
 
-def make_rules(config=None, *, lanes=1, width=5.0, bank=None, demo_steps=DEMO_STEPS):
+def make_rules(config=None, *, lanes=1, width=5.0, buffer=None, demo_steps=DEMO_STEPS):
     rules = PracticeRules(
         config or PracticeConfig(), lanes=lanes, dt=DT, demo_steps=demo_steps, frames_of=lambda steps: steps
     )
-    rules.use(Places(width), bank)
+    rules.use(Places(width), buffer)
     return rules
 
 
@@ -57,29 +64,37 @@ def step(clock, places, elapsed=None):
     elapsed = clock + 1 if elapsed is None else np.broadcast_to(elapsed, clock.shape)
     return Step(
         obs=obs * np.nan, actions=np.zeros((len(clock), 3)), clock=clock, elapsed=elapsed, next_obs=obs,
-        next_qpos=none, next_qvel=none,
+        next_qpos=none, next_qvel=none, rewards=none[:, 0], terminated=none[:, 0] > 0,
+        truncated=none[:, 0] > 0,
     )  # fmt: skip
 
 
-# The clock
+def scored(rules, moved):
+    """The rewards of the steps so far, in which the phase moved on by so much, (N, T)."""
+    moved = np.array(moved)
+    return rules.score(SimpleNamespace(clock=np.zeros_like(moved), next_clock=moved))  # type: ignore[arg-type]
+
+
+# The phase
 
 
 def test_a_fixed_clock_moves_by_one_and_pays_the_similarity_there():
     rules = make_rules(PracticeConfig(elastic=False), lanes=3, width=4.0)
     assert rules.advance(step([10, 10, 10], [11, 19, 60])).tolist() == [11, 11, 11]
     # 8 steps off cost two points of four: similarity 0.5
-    np.testing.assert_allclose(rules.take_rewards(), [[1.0], [0.5], [0.0]], atol=1e-6)
-    assert rules.mean_similarity == pytest.approx(0.5)
+    np.testing.assert_allclose(scored(rules, [[1]] * 3), [[1.0], [0.5], [0.0]], atol=1e-6)
 
 
-def test_an_elastic_clock_goes_to_where_the_demo_is_most_like_the_robot():
+def test_an_adaptive_phase_goes_to_where_the_demo_is_most_like_the_robot():
     rules = make_rules(lanes=6)
     moved = rules.advance(step(np.full(6, 100), [90, 100, 101, 102, 103, 110])) - 100
     assert moved.tolist() == [0, 0, 1, 2, 3, 3]
     # Nobody is paid for standing still, however like the demo; and for more steps, more.
     similar = [0.5, 1.0, 1.0, 1.0, 1.0, 1 - 7 / 20]
-    np.testing.assert_allclose(rules.take_rewards()[:, 0], similar * moved, atol=1e-6)
-    assert rules.mean_similarity == pytest.approx(np.mean(similar))
+    rewards = scored(rules, moved[:, None])
+    np.testing.assert_allclose(rewards[:, 0], similar * moved, atol=1e-6)
+    rating = mean_rating(rewards.ravel(), moved)  # of the demo that was passed
+    assert rating == pytest.approx(1 + 4 * (similar * moved).sum() / moved.sum())
 
 
 def test_moves_that_gain_next_to_nothing_are_not_made():
@@ -112,7 +127,7 @@ def test_the_clock_keeps_within_its_slack_of_real_time(slack):
 
 
 def test_the_slack_is_counted_from_the_demo_step_an_episode_starts_at():
-    """A start from the bank at step 100 is not 100 steps ahead: ``elapsed`` starts there too."""
+    """A start from the buffer at step 100 is not 100 steps ahead: ``elapsed`` starts there too."""
     rules = make_rules(PracticeConfig(slack_seconds=5 * DT))
     assert rules.advance(step([100], [103], elapsed=101)).tolist() == [103]
 
@@ -125,7 +140,7 @@ def test_all_of_the_demo_is_worth_the_same_at_any_speed():
         rules = make_rules(config)
         clocks = run(rules, lambda t, speed=speed: int(speed * t), round(300 / speed))
         assert clocks[-1] == 300
-        sums.append(rules.take_rewards().sum())
+        sums.append(scored(rules, [np.diff(clocks, prepend=0)]).sum())
     assert sums == pytest.approx([300, 300, 300], rel=1e-3)
 
 
@@ -133,20 +148,23 @@ def test_past_its_end_the_demo_stands_still():
     rules = make_rules()
     last = DEMO_STEPS - 1
     assert rules.advance(step([last], [last])).tolist() == [DEMO_STEPS]
-    assert rules.take_rewards().tolist() == [[pytest.approx(1.0)]]
+    assert scored(rules, [[1]]).tolist() == [[pytest.approx(1.0)]]
 
 
-def test_rewards_are_taken_once_and_in_order():
+def test_rewards_are_given_once_and_in_order():
     rules = make_rules(PracticeConfig(elastic=False), lanes=2)
     for clock in range(3):
-        rules.advance(step([clock, clock], [clock + 1, clock + 11]))
-    assert rules.take_rewards().shape == (2, 3)
+        rules.advance(step([clock, clock], [clock + 1, clock + 6 + clock]))
+    np.testing.assert_allclose(scored(rules, np.ones((2, 3))), [[1, 1, 1], [0.75, 0.7, 0.65]], atol=1e-6)
     rules.advance(step([3, 3], [4, 4]))
-    assert rules.take_rewards().shape == (2, 1)
-    assert rules.mean_similarity == pytest.approx(1.0)
+    assert scored(rules, [[1], [1]]).tolist() == [[1.0], [1.0]]
 
 
-# Giving up
+def test_where_the_demo_stood_still_the_mean_rating_is_the_lowest():
+    assert mean_rating(np.zeros((2, 3)), np.zeros((2, 3))).tolist() == [1, 1]
+
+
+# Early termination
 
 
 def given_up_after(rules, places, start=0, limit=100):
@@ -170,7 +188,7 @@ def test_an_episode_is_given_up_once_its_running_similarity_is_too_low():
 
 def test_nothing_is_given_up_in_the_first_steps_of_an_episode():
     config = PracticeConfig(elastic=False, give_up=0.55)  # 0.6 (24/25)^3 is below already
-    for start in (0, 150):  # at step 150: from the bank
+    for start in (0, 150):  # at step 150: from the buffer
         rules = make_rules(config, lanes=2, width=1.0)
         assert given_up_after(rules, [10**4, 10**4], start=start).tolist() == [11, 11]
 
@@ -186,7 +204,7 @@ def test_a_timid_predictor_gives_up_later():
     """What counts is the share of what the predictor gives at best: half of 0.3 is 0.15."""
     rules = make_rules(PracticeConfig(elastic=False, give_up=0.3), lanes=2, width=10**3)
     none = np.zeros((1, 6))
-    rules.use(rules._snapshot, Bank(qpos=none, qvel=none, clock=np.zeros(1, np.int32), similarity=0.5))
+    rules.use(rules._snapshot, ResetBuffer(qpos=none, qvel=none, clock=np.zeros(1, np.int32), similarity=0.5))
     assert given_up_after(rules, [10**4, 0]).tolist() == [34, 100]
 
 
@@ -210,7 +228,7 @@ def test_a_resumed_practice_gives_up_when_the_uninterrupted_one_does():
     assert given_up_after(first, [10**4, 0])[0] == 3
 
 
-# The bank
+# The reset buffer
 
 
 @pytest.fixture(scope="module")
@@ -223,44 +241,44 @@ def states():
     return replace(rollouts, obs=obs, qpos=qpos)
 
 
-def make_bank(states, seed=0, demo_steps=DEMO_STEPS):
-    return fill_bank(Places(), states, lambda steps: steps, demo_steps, np.random.default_rng(seed))
+def make_buffer(states, seed=0, demo_steps=DEMO_STEPS):
+    return fill_reset_buffer(Places(), states, lambda steps: steps, demo_steps, np.random.default_rng(seed))
 
 
-def test_the_bank_holds_the_states_most_like_each_part_of_the_demo(states):
-    bank = make_bank(states)
-    assert bank.clock.dtype == np.int32 and len(bank.clock) == len(bank.qpos) == len(bank.qvel)
-    moments, counts = np.unique(bank.clock, return_counts=True)
+def test_the_reset_buffer_holds_the_states_most_like_each_part_of_the_demo(states):
+    buffer = make_buffer(states)
+    assert buffer.clock.dtype == np.int32 and len(buffer.clock) == len(buffer.qpos) == len(buffer.qvel)
+    moments, counts = np.unique(buffer.clock, return_counts=True)
     assert len(set(counts)) == 1
     assert np.diff(moments).max() == 20  # a start in every part ...
     assert moments[0] == 0 and DEMO_STEPS - 60 <= moments[-1] <= DEMO_STEPS - 40  # ... with practice ahead
-    off = np.abs(bank.qpos[:, 0] - bank.clock)
+    off = np.abs(buffer.qpos[:, 0] - buffer.clock)
     assert off.max() < 5  # 1,600 states on 400 steps
-    assert bank.similarity == pytest.approx(1 - off.mean() / 5 / 4, abs=1e-6)
+    assert buffer.similarity == pytest.approx(1 - off.mean() / 5 / 4, abs=1e-6)
     flat = states.qpos.reshape(-1, 6)
-    rows = [int(np.flatnonzero((flat == qpos).all(axis=1))[0]) for qpos in bank.qpos]
-    np.testing.assert_array_equal(states.qvel.reshape(-1, 6)[rows], bank.qvel)
+    rows = [int(np.flatnonzero((flat == qpos).all(axis=1))[0]) for qpos in buffer.qpos]
+    np.testing.assert_array_equal(states.qvel.reshape(-1, 6)[rows], buffer.qvel)
 
 
-def test_a_bank_follows_its_seed_and_fits_a_short_demo(states):
-    one, two, other = make_bank(states, 1), make_bank(states, 1), make_bank(states, 2)
+def test_a_reset_buffer_follows_its_seed_and_fits_a_short_demo(states):
+    one, two, other = make_buffer(states, 1), make_buffer(states, 1), make_buffer(states, 2)
     np.testing.assert_array_equal(one.qpos, two.qpos)
     assert not np.array_equal(one.qpos, other.qpos)
-    assert set(make_bank(states, demo_steps=38).clock) == {0}
+    assert set(make_buffer(states, demo_steps=38).clock) == {0}
 
 
-def test_a_share_of_the_episodes_starts_in_the_bank_and_the_others_stand(states):
-    bank, lanes = make_bank(states), np.arange(1000)
+def test_a_share_of_the_episodes_starts_in_the_reset_buffer_and_the_others_stand(states):
+    buffer, lanes = make_buffer(states), np.arange(1000)
     for share in (0.0, 0.3, 1.0):
-        rules = make_rules(PracticeConfig(bank_share=share), lanes=1000, bank=bank)
+        rules = make_rules(PracticeConfig(bank_share=share), lanes=1000, buffer=buffer)
         starts = rules.start(lanes, np.random.default_rng(0))
         assert len(starts.lanes) / 1000 == pytest.approx(share, abs=0.05)
         assert len(np.unique(starts.lanes)) == len(starts.lanes)
         for qpos, qvel, clock in zip(starts.qpos, starts.qvel, starts.clock, strict=True):
-            row = np.flatnonzero((bank.qpos == qpos).all(axis=1) & (bank.clock == clock))
-            assert len(row) and (bank.qvel[row] == qvel).all()
+            row = np.flatnonzero((buffer.qpos == qpos).all(axis=1) & (buffer.clock == clock))
+            assert len(row) and (buffer.qvel[row] == qvel).all()
         if share == 1.0:
-            assert len(np.unique(starts.clock)) == len(np.unique(bank.clock))
+            assert len(np.unique(starts.clock)) == len(np.unique(buffer.clock))
     assert make_rules().start(lanes[:1], np.random.default_rng(0)) is None
 
 
@@ -275,10 +293,12 @@ def test_practice_in_the_real_environment():
     """Clocks, starts and rewards belong together, step by step, episode by episode."""
     lanes, horizon = 8, 60
     qpos = np.tile([0, 1.25, 0.5, 0, 0, 0], (3, 1))
-    bank = Bank(qpos=qpos, qvel=np.zeros((3, 6)), clock=np.array([0, 20, 40], np.int32), similarity=1.0)
+    buffer = ResetBuffer(
+        qpos=qpos, qvel=np.zeros((3, 6)), clock=np.array([0, 20, 40], np.int32), similarity=1.0
+    )
     config = PracticeConfig(slack_seconds=6 * DT, give_up=0.3)
     rules = make_rules(config, lanes=lanes, demo_steps=horizon)
-    rules.use(Leaning(6.0), bank)
+    rules.use(Leaning(6.0), buffer)
     env = vector_env.make("hopper", lanes, horizon=horizon, nthread=0)
     policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=horizon, seed=0)
     rollouts = Collector(env, seed=0, rules=rules).collect(policy.snapshot(), 200)
@@ -286,7 +306,7 @@ def test_practice_in_the_real_environment():
     assert moved.min() == 0 and moved.max() == 3
     shown = np.minimum(rollouts.next_clock, horizon - 1)
     similar = (Leaning(6.0).ratings(shown, rollouts.next_obs, rollouts.actions) - 1) / 4
-    np.testing.assert_allclose(rules.take_rewards(), similar * moved, atol=1e-6)
+    np.testing.assert_allclose(rollouts.rewards, similar * moved, atol=1e-6)
     ended = rollouts.terminated | rollouts.truncated
     assert rollouts.terminated.any() and rollouts.truncated.any()
     began = np.zeros_like(ended)
@@ -308,8 +328,28 @@ def test_bad_settings_say_which(change):
         PracticeConfig(**change)
 
 
-def test_practice_is_plain_only_with_everything_off():
+def test_with_everything_off_a_whole_batch_is_scored_as_step_by_step():
+    """The paper's rules: standing starts, a fixed phase, no early end, the state after each step."""
     off = {"elastic": False, "bank_share": 0.0, "give_up": 0.0}
-    assert PracticeConfig(**off).plain and not PracticeConfig().plain
-    for name in off:
-        assert not PracticeConfig(**{k: v for k, v in off.items() if k != name}).plain, name
+    found = []
+    for config in (PracticeConfig(**off), PracticeConfig(**off | {"give_up": 1e-9})):
+        rules = make_rules(config, lanes=4, demo_steps=40)
+        rules.use(Leaning(6.0), None)
+        env = vector_env.make("hopper", 4, horizon=40, nthread=0)
+        policy = Policy(PolicyConfig(kind="raw"), obs_size=11, action_size=3, horizon=40, seed=0)
+        found.append(Collector(env, seed=0, rules=rules).collect(policy.snapshot(), 100))
+    whole, stepped = found
+    np.testing.assert_allclose(whole.rewards, stepped.rewards, atol=1e-6)
+    assert (whole.next_clock - whole.clock == 1).all() and not whole.terminated.any()
+    assert np.abs(whole.qpos[whole.clock == 0][:, 1:] - [1.25, 0, 0, 0, 0]).max() < 0.01
+    shown = np.minimum(whole.next_clock, 39)
+    expected = (Leaning(6.0).ratings(shown, whole.next_obs, whole.actions) - 1) / 4
+    np.testing.assert_allclose(whole.rewards, expected, atol=1e-6)
+    assert np.ptp(whole.rewards) > 0.1
+
+
+def test_a_state_without_running_similarity_is_one_of_rules_that_need_none():
+    """So says a checkpoint of the paper's method."""
+    off = make_rules(PracticeConfig(elastic=False, bank_share=0.0, give_up=0.0))
+    assert off.state_dict() == {}
+    off.load_state_dict({})

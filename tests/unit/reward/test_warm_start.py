@@ -15,11 +15,10 @@ from onedemo.storage.store import RatedSegment, Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
-from onedemo.training.trainer import Trainer
 from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track
 from unit.reward.test_model import world
-from unit.training.test_trainer import by_rule, make_trainer
+from unit.training.test_trainer import by_rule, make_run, work
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)
 METRIC = PredictorConfig(members=2)
@@ -238,18 +237,14 @@ def demo(tmp_path_factory):
 def start_file(demo, directory):
     """The newest predictor of a whole small run."""
     store = Store(directory)
-    make_trainer(store, demo, Simulated(name="rule", rate=by_rule), name="before").work()
+    work(make_run(store, demo, Simulated(name="rule", rate=by_rule), name="before"))
     file = newest_snapshot(store, directory, "before")
     store.close()
     return file
 
 
 def begin(store, demo, rate, start=None):
-    given = make_trainer(store, demo, Simulated(name="rule", rate=rate))
-    return Trainer(
-        store=store, data_dir=store.path.parent, run="r", demo=demo, config=given.config,
-        encoder=given._encoder, simulated=Simulated(name="rule", rate=rate), start=start,
-    )  # fmt: skip
+    return make_run(store, demo, Simulated(name="rule", rate=rate), start=start)
 
 
 @pytest.mark.slow
@@ -257,30 +252,20 @@ def test_a_run_from_a_start_goes_on_without_it(demo, tmp_path):
     """Stopped and gone on with after the other run is gone, it ends like the uninterrupted one."""
     start = start_file(demo, tmp_path / "source")
     whole, parts, plain = (Store(tmp_path / name) for name in ("whole", "parts", "plain"))
-    uninterrupted = begin(whole, demo, by_rule, start)
-    uninterrupted.work()
-
-    def rate_and_stop(segment, demo_step):
-        if first.status().iteration >= 3:
-            first.stop()
-        return by_rule(segment, demo_step)
-
-    first = begin(parts, demo, rate_and_stop, start)
-    first.work()
+    work(begin(whole, demo, by_rule, start))
+    work(begin(parts, demo, by_rule, start), iterations=3)
     assert 3 <= len(parts.iterations("r")) < 6
     moved = start.with_name("moved.pt")
     start.rename(moved)
-    second = begin(parts, demo, by_rule)
-    second.work()
-    again = begin(parts, demo, by_rule, moved)  # the same start under another name is no contradiction
-    again.work()
+    work(begin(parts, demo, by_rule))
+    work(begin(parts, demo, by_rule, moved))  # the same start under another name is no contradiction
     other = torch.load(moved, weights_only=True) | {"number": 77}
     torch.save(other, tmp_path / "other.pt")
     with pytest.raises(UserError, match="started from another predictor"):
-        begin(parts, demo, by_rule, tmp_path / "other.pt").work()
-    begin(plain, demo, by_rule).work()
+        work(begin(parts, demo, by_rule, tmp_path / "other.pt"))
+    work(begin(plain, demo, by_rule))
     with pytest.raises(UserError, match="has begun without a predictor to start from"):
-        begin(plain, demo, by_rule, moved).work()
+        work(begin(plain, demo, by_rule, moved))
     figures = [[row["predicted"] for row in store.iterations("r")] for store in (whole, parts, plain)]
     # What the resumed run asked in the iteration that was cut off may differ; all before it may not.
     assert figures[0][:3] == figures[1][:3] and len(figures[1]) == 6

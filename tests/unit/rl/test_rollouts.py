@@ -40,7 +40,7 @@ def test_shapes_and_kinds():
         array = getattr(batch, name)
         assert array.shape == (4, 30, last), name
         assert array.dtype == kind, name
-    for name in ("clock", "next_clock", "env_rewards", "terminated", "truncated"):
+    for name in ("clock", "next_clock", "rewards", "terminated", "truncated"):
         assert getattr(batch, name).shape == (4, 30), name
 
 
@@ -69,14 +69,14 @@ def test_each_step_follows_from_the_one_before():
     for t in range(HORIZON):
         np.testing.assert_array_equal(env.qpos, batch.qpos[:, t])
         _, rewards, *_ = env.step(batch.actions[:, t])
-        np.testing.assert_array_equal(rewards, batch.env_rewards[:, t])
+        np.testing.assert_array_equal(rewards, batch.rewards[:, t])
 
 
 def test_lanes_go_on_between_batches():
     whole = collector().collect(policy(), 60)
     parts = collector()
     first, second = parts.collect(policy(), 25), parts.collect(policy(), 35)
-    for name in ("obs", "actions", "clock", "env_rewards", "truncated"):
+    for name in ("obs", "actions", "clock", "rewards", "truncated"):
         joined = np.concatenate([getattr(first, name), getattr(second, name)], axis=1)
         np.testing.assert_array_equal(joined, getattr(whole, name))
 
@@ -131,10 +131,14 @@ class Elastic(EpisodeRules):
     def stop(self, step, next_clock):
         return step.next_qpos[:, 1] < 1.2
 
+    def score(self, batch):
+        return 10 * batch.next_qpos[..., 1]
+
 
 def test_rules_start_advance_and_stop():
     lanes = collector(lanes=16, rules=Elastic(), stagger=False)
     batch = lanes.collect(policy(), 120)
+    np.testing.assert_array_equal(batch.rewards, 10 * batch.next_qpos[..., 1])
     started = batch.clock == 10
     airborne = started & (np.abs(batch.qpos[..., 2] + 3.0) < 1e-9)
     assert airborne.any()
@@ -175,6 +179,10 @@ def test_evaluate_gives_whole_episodes():
     fast = evaluate(snapshot, "hopper", episodes=3, seed=5, rules=Elastic(), nthread=0)
     assert fast.clock[0, 5] == 10
     assert fast.clock[0, -1] == HORIZON
+    np.testing.assert_array_equal(fast.rewards, 10 * fast.qpos[:, 1:, 1])
+    part = evaluate(snapshot, "hopper", episodes=3, seed=5, horizon=10, rules=Elastic(), nthread=0)
+    for name in ("obs", "qvel", "clock"):  # its clock is further than its time, and nothing ends
+        np.testing.assert_array_equal(getattr(part, name), getattr(fast, name)[:, :11])
     short = evaluate(snapshot, "hopper", episodes=1, horizon=7, nthread=0)
     assert short.qpos.shape == (1, 8, 6)
     with pytest.raises(UserError, match="choose one of"):

@@ -1,6 +1,7 @@
 """The mathematics of TRPO against dense linear algebra and values worked by hand."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,6 +122,11 @@ def test_fisher_product_does_not_depend_on_how_the_samples_are_cut(monkeypatch):
     torch.testing.assert_close(fisher_product(policy, inputs, damping=0.1)(vector), whole)
 
 
+def paid(rollouts, rewards):
+    """The same rollouts with other rewards, (N, T)."""
+    return replace(rollouts, rewards=rewards)
+
+
 def made_up_rollouts(policy, lanes=8, steps=100, seed=0):
     """One state after another, at random; what was done does not matter to what comes."""
     rng = np.random.default_rng(seed)
@@ -137,7 +143,7 @@ def made_up_rollouts(policy, lanes=8, steps=100, seed=0):
         clock=clock,
         inputs=inputs,
         next_inputs=snapshot.inputs(obs[:, 1:], clock + 1),
-        env_rewards=np.zeros((lanes, steps)),
+        rewards=np.zeros((lanes, steps)),
         terminated=none,
         truncated=none,
     )
@@ -158,7 +164,7 @@ def test_the_step_stays_in_the_trust_region_and_uses_it(max_kl):
         inputs = torch.from_numpy(rollouts.inputs).flatten(0, 1)
         with torch.no_grad():
             old_mean, old_log_std = policy(inputs), policy.log_std.clone()
-        stats = trpo.update(rollouts, towards_the_first_state(rollouts))
+        stats = trpo.update(paid(rollouts, towards_the_first_state(rollouts)))
         with torch.no_grad():
             kl = mean_kl(old_mean, old_log_std, policy(inputs), policy.log_std).item()
         assert stats.accepted
@@ -178,7 +184,7 @@ def largest_step(config, progress):
         inputs = torch.from_numpy(rollouts.inputs).flatten(0, 1)
         with torch.no_grad():
             old_mean, old_log_std = policy(inputs), policy.log_std.clone()
-        assert trpo.update(rollouts, towards_the_first_state(rollouts), progress=progress).accepted
+        assert trpo.update(paid(rollouts, towards_the_first_state(rollouts)), progress=progress).accepted
         with torch.no_grad():
             kl = mean_kl(old_mean, old_log_std, policy(inputs), policy.log_std).item()
         longest = max(longest, kl)
@@ -207,7 +213,7 @@ def test_learns_what_it_is_paid_for():
         rollouts = made_up_rollouts(policy, seed=seed)
         reward = towards_the_first_state(rollouts)
         rewards.append(reward.mean())
-        trpo.update(rollouts, reward)
+        trpo.update(paid(rollouts, reward))
     # Doing nothing with no noise would get -2: the mean square of the target, twice.
     assert rewards[0] < -3
     assert rewards[-1] > -0.7
@@ -225,7 +231,7 @@ def test_the_scale_of_the_rewards_does_not_matter():
         trpo = Trpo(policy, TrpoConfig(), seed=0)
         for seed in range(3):
             rollouts = made_up_rollouts(policy, seed=seed)
-            trpo.update(rollouts, scale * towards_the_first_state(rollouts))
+            trpo.update(paid(rollouts, scale * towards_the_first_state(rollouts)))
         ends.append(parameters(policy))
     torch.testing.assert_close(ends[0], ends[1], rtol=1e-3, atol=1e-4)
 
@@ -235,7 +241,7 @@ def test_nothing_to_gain_changes_nothing():
     rollouts = made_up_rollouts(policy)
     before = parameters(policy).clone()
     stats = Trpo(policy, TrpoConfig(gamma=0.0, value_epochs=0), seed=0).update(
-        rollouts, np.zeros(rollouts.clock.shape) + rollouts.obs[..., 0] * 0
+        paid(rollouts, np.zeros(rollouts.clock.shape))
     )
     assert torch.isfinite(parameters(policy)).all()
     assert stats.kl <= TrpoConfig().max_kl
@@ -254,7 +260,7 @@ def test_value_function_bootstraps_through_the_time_limit():
         rollouts = Rollouts(**fields)
         trpo = Trpo(policy, TrpoConfig(gamma=0.8, value_epochs=20, value_rate=3e-3), seed=0)
         for _ in range(40):
-            trpo.update(rollouts, np.ones((16, 50)))
+            trpo.update(paid(rollouts, np.ones((16, 50))))
         with torch.no_grad():
             value = trpo.value(torch.from_numpy(rollouts.inputs)).mean().item()
         if expected:
@@ -271,8 +277,8 @@ def hopper(seed, rounds, lanes=16, steps=250):
     per_episode = []
     for _ in range(rounds):
         batch = collector.collect(policy.snapshot(), steps)
-        trpo.update(batch, batch.env_rewards)
-        per_episode.append(batch.env_rewards.sum() / batch.terminated.sum())
+        trpo.update(batch)
+        per_episode.append(batch.rewards.sum() / batch.terminated.sum())
     return policy, trpo, collector, per_episode
 
 
@@ -293,7 +299,7 @@ def test_value_after_a_step_that_ended_an_episode_is_of_where_it_ended(monkeypat
     changed = {"next_inputs": elsewhere, "truncated": ended}
     rollouts = Rollouts(**{key: getattr(rollouts, key) for key in Rollouts.__slots__} | changed)
     trpo = Trpo(policy, TrpoConfig(), seed=0)
-    trpo.update(rollouts, rollouts.obs[..., 0])  # V is zero everywhere before the first fit
+    trpo.update(paid(rollouts, rollouts.obs[..., 0]))  # V is zero everywhere before the first fit
     seen = {}
 
     def spy(rewards, values, next_values, *rest, **options):
@@ -304,7 +310,7 @@ def test_value_after_a_step_that_ended_an_episode_is_of_where_it_ended(monkeypat
     with torch.no_grad():
         values = trpo.value(torch.from_numpy(rollouts.inputs)).numpy()
         next_values = trpo.value(torch.from_numpy(elsewhere)).numpy()
-    trpo.update(rollouts, rollouts.obs[..., 0])
+    trpo.update(paid(rollouts, rollouts.obs[..., 0]))
     np.testing.assert_allclose(seen["values"], values, atol=1e-6)
     np.testing.assert_allclose(seen["next_values"], next_values, atol=1e-6)
     assert np.abs(next_values[:, :-1] - values[:, 1:])[ended[:, :-1]].max() > 1e-3
@@ -341,7 +347,7 @@ def test_same_seed_same_policy_and_resumed_training_is_the_same():
     fresh_collector.load_state_dict(saved["collector"])
     for _ in range(2):
         batch = fresh_collector.collect(resumed.snapshot(), 100)
-        trpo.update(batch, batch.env_rewards)
+        trpo.update(batch)
     assert torch.equal(parameters(resumed), parameters(policy))
     other, *_ = hopper(4, 4, lanes=4, steps=100)
     assert not torch.equal(parameters(other), parameters(policy))
@@ -352,9 +358,9 @@ def test_bad_input():
     rollouts = made_up_rollouts(policy)
     trpo = Trpo(policy, TrpoConfig(), seed=0)
     with pytest.raises(ValueError, match="rewards must be finite"):
-        trpo.update(rollouts, np.zeros((8, 99)))
+        trpo.update(paid(rollouts, np.zeros((8, 99))))
     with pytest.raises(ValueError, match="rewards must be finite"):
-        trpo.update(rollouts, np.full((8, 100), np.nan))
+        trpo.update(paid(rollouts, np.full((8, 100), np.nan)))
     for name, value in {
         "max_kl": 0,
         "final_kl": 0,

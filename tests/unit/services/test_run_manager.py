@@ -14,7 +14,7 @@ from onedemo.render.renderer import RenderThread
 from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
-from onedemo.training.trainer import Trainer
+from onedemo.training.training_run import TrainingRun
 from onedemo.types import Rater
 
 pytestmark = pytest.mark.seam
@@ -30,10 +30,13 @@ def study(tmp_path, monkeypatch):
         for name in ("first", "second"):
             add_run(store, data_dir, demo, small_config(), name=name)
         rated = Simulated(name="rule", rate=lambda segment, step: 1 + step % 5)
-        Trainer(
+        training = TrainingRun(
             store=store, data_dir=data_dir, run="second", demo=demo, config=small_config(),
             encoder=Thumbnail(), simulated=rated,
-        ).work()  # fmt: skip
+        )  # fmt: skip
+        training.prepare()
+        while training.step() != "done":
+            pass
         served = []
         study = Study(store, data_dir, drawing, served=lambda trainer: served.append(trainer.run))
         study.shown = served  # type: ignore[attr-defined]

@@ -180,7 +180,7 @@ def test_learning_works_on_it():
         batch = collector.collect(policy.snapshot(), 25)
         assert batch.obs.shape == (16, 25, 11) and np.isfinite(batch.next_qvel).all()
         assert batch.truncated.any()
-        stats = trpo.update(batch, batch.env_rewards)
+        stats = trpo.update(batch)
         assert 0 < stats.kl <= TrpoConfig().max_kl
     env.close()
 

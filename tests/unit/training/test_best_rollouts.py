@@ -1,7 +1,5 @@
 """What is kept of an iteration, and what is drawn of it when somebody asks."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,25 +7,34 @@ from helpers.small_world import falling_demo, falling_states
 from onedemo.app.ui.progress import chosen, gallery_html, timeline_html
 from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
+from onedemo.rl.rollouts import Transitions
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery
+from onedemo.types import Rollouts
 from unit.queries.test_selection import rollouts as empty_rollouts
 
 
-class ByLane:
-    """Rates lane k with 1 + k, a point less in the second half of the demo."""
-
-    def ratings(self, frames, obs, actions):
-        return 1.0 + np.arange(len(frames))[:, None] - (frames >= 120)
+def rated(clock, moved=1, **changes):
+    """Rollouts of which lane k is rated 1 + k, a point less in the second half of the demo."""
+    plain = empty_rollouts(clock)
+    next_clock = clock + moved
+    ratings = 1.0 + np.arange(len(clock))[:, None] - (next_clock >= 500)
+    none = np.zeros((*clock.shape, 0))
+    fields = {name: getattr(plain, name) for name in Rollouts.__slots__}
+    fields |= {"rewards": (ratings - 1) / 4 * moved, "next_clock": next_clock} | changes
+    return Transitions(**fields, next_obs=none, next_qpos=none, next_qvel=none)
 
 
 def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there(tmp_path):
-    clock = np.tile(np.arange(200, 700), (3, 1)).astype(np.int32)
     gallery = Gallery(tmp_path, None, 0.008, None)
-    told = gallery.note(1, ByLane(), empty_rollouts(clock), lambda steps: steps * 240 // 1000, 1000)
-    parts = told["timeline"]
-    assert len(parts) == PARTS and "best" not in told  # no episode ended
-    assert [k for k, part in enumerate(parts) if part is not None] == list(range(8, 28))
-    assert parts[8:20] == [2.0] * 12 and parts[20:28] == [1.0] * 8
+    for moved, reached in ((1, 700), (2, 1000)):
+        clock = np.tile(np.arange(200, reached, moved), (3, 1)).astype(np.int32)
+        told = gallery.note(1, rated(clock, moved), lambda steps: steps * 240 // 1000, 1000)
+        parts = told["timeline"]
+        assert len(parts) == PARTS and "best" not in told  # no episode ended
+        assert [k for k, part in enumerate(parts) if part is not None] in (
+            list(range(8, 29)), list(range(8, 40)),
+        )  # fmt: skip
+        assert parts[8:20] == [2.0] * 12 and parts[20:28] == [1.0] * 8
 
 
 def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_quarter_of_one(tmp_path):
@@ -36,11 +43,10 @@ def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_
     gallery = Gallery(tmp_path, None, 0.008, None)
     kept = []
     for k in range(8):
-        part = empty_rollouts(np.arange(250)[None] * np.ones((2, 1)))
         clock = clocks[:, 250 * k : 250 * (k + 1)].astype(np.int32)
         qpos = np.repeat(clock[..., None], 6, axis=2).astype(float)
-        part = replace(part, clock=clock, qpos=qpos, truncated=clock == 999)
-        told = gallery.note(k + 1, ByLane(), part, lambda steps: steps * 240 // 1000, 1000)
+        part = rated(clock, qpos=qpos, truncated=clock == 999)
+        told = gallery.note(k + 1, part, lambda steps: steps * 240 // 1000, 1000)
         kept.append(told.get("best"))
     # The episodes under way when it began to look are not whole; nor is the second lane's of 100 steps.
     assert [k for k, best in enumerate(kept) if best is not None] == [4, 7]
@@ -52,8 +58,10 @@ def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_
 
 
 def test_a_long_attempt_is_better_than_a_good_moment():
-    short = Episode(np.zeros((10, 6)), np.arange(10), np.full(2, 4.0))
-    long = Episode(np.zeros((1000, 6)), np.arange(1000), np.full(200, 3.0))
+    short, long = (
+        Episode(np.zeros((steps, 6)), np.arange(steps), np.full(steps, reward), np.ones(steps, int))
+        for steps, reward in ((10, 0.75), (1000, 0.5))
+    )
     assert long.worth > short.worth
 
 

@@ -20,12 +20,12 @@ def features():
 def few_random_states(monkeypatch):
     """A run draws 61,440 of them, which takes a while."""
     monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 1000)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 1000)
     torch.set_num_threads(1)  # as a run does
 
 
 def onedemo(**overrides):
-    """The method's own settings, in small; episodes end early and start in the bank."""
+    """The method's own settings, in small; episodes end early and start in the reset buffer."""
     return small_config(**{"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3} | overrides)
 
 
@@ -274,7 +274,7 @@ def test_of_another_body_it_sees_pictures_and_imagines_poses(features):
 
 @pytest.mark.slow
 def test_practice_follows_the_predictor(features, by_distance):
-    """Starts from its bank, a clock that waits and hurries, episodes given up; rewards of all that."""
+    """Starts from its reset buffer, an adaptive phase, early ends; rewards of all that."""
     learner = make_learner(features, onedemo(rollouts__lanes=32, rollouts__steps=100))
     snapshot, _ = learner.fit(asked(learner, by_distance, 60), 1)
     assert isinstance(snapshot, MetricSnapshot)
@@ -290,21 +290,22 @@ def test_practice_follows_the_predictor(features, by_distance):
     assert len(np.unique(rollouts.clock[lanes, steps + 1])) > 3
     frames = learner.frames_of(np.minimum(rollouts.next_clock, STEPS - 1))
     similar = (snapshot.ratings(frames, rollouts.next_obs, rollouts.actions) - 1) / 4
-    assert stats["mean_reward"] == pytest.approx((similar * moved).mean(), rel=1e-4)
-    assert stats["predicted"] == pytest.approx(1 + 4 * similar.mean(), rel=1e-4)
+    np.testing.assert_allclose(rollouts.rewards, similar * moved, atol=1e-5)
+    assert stats["mean_reward"] == pytest.approx(rollouts.rewards.mean())
+    assert stats["predicted"] == pytest.approx(1 + 4 * rollouts.rewards.sum() / moved.sum())
     np.testing.assert_array_equal(rollouts.next_qpos[:, -1][~ended[:, -1]], again.qpos[:, 0][~ended[:, -1]])
 
 
 @pytest.mark.slow
-def test_a_new_snapshot_fills_a_new_bank(features, by_distance):
+def test_a_new_snapshot_fills_a_new_reset_buffer(features, by_distance):
     learner = make_learner(features, onedemo())
     ratings = asked(learner, by_distance, 40)
-    banks = []
+    buffers = []
     for number, some in ((1, ratings[:20]), (1, ratings[:20]), (2, ratings)):
         learner.iterate(learner.fit(some, number)[0])
-        banks.append(learner._rules._bank)
-    assert banks[0] is banks[1] is not banks[2]
-    assert not np.array_equal(banks[0].qpos, banks[2].qpos)
+        buffers.append(learner._buffer)
+    assert buffers[0] is buffers[1] is not buffers[2]
+    assert not np.array_equal(buffers[0].qpos, buffers[2].qpos)
 
 
 @pytest.mark.slow
@@ -320,8 +321,8 @@ def test_onedemo_end_to_end_learns_to_be_like_the_demo(features, by_distance):
 
     def whole_episodes():
         rules = learner.rules(8, snapshot)
-        evaluate(learner.policy(), "hopper", episodes=8, seed=9, rules=rules, nthread=0)
-        return rules.take_rewards().sum(axis=1).mean()
+        episodes = evaluate(learner.policy(), "hopper", episodes=8, seed=9, rules=rules, nthread=0)
+        return episodes.rewards.sum(axis=1).mean()
 
     before, curve = whole_episodes(), []
     while learner.env_steps < 20_000:
@@ -336,13 +337,16 @@ def test_a_policy_is_summarised_before_there_is_a_predictor(features):
 
 
 @pytest.mark.slow
-def test_evaluation_uses_the_elastic_clock(features, by_distance):
+def test_evaluation_uses_the_adaptive_phase(features, by_distance):
     learner = make_learner(features, onedemo())
     snapshot, _ = learner.fit(asked(learner, by_distance, 30), 1)
     episodes = evaluate(learner.policy(), "hopper", episodes=4, rules=learner.rules(4, snapshot), nthread=0)
     moves = np.diff(episodes.clock, axis=1)
     assert episodes.clock.max() <= STEPS and set(np.unique(moves)) <= {0, 1, 2, 3} and (moves != 1).any()
-    assert type(make_learner(features).rules(4, None)).__name__ == "EpisodeRules"
+    paper = make_learner(features)
+    snapshot, _ = paper.fit(rated(paper), 1)
+    episodes = evaluate(paper.policy(), "hopper", episodes=4, rules=paper.rules(4, snapshot), nthread=0)
+    assert (np.diff(episodes.clock, axis=1) == 1).all()
 
 
 def test_random_starts_count_from_anywhere_in_the_demo(features):

@@ -1,9 +1,11 @@
 import ast
 import os
 import re
+import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,9 @@ import torch
 
 import onedemo
 from helpers.small_world import Thumbnail, drawn_demo, falling_demo, small_config
+from onedemo.core.files import hold
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
+from onedemo.errors import UserError
 from onedemo.reward.episode_rules import PracticeRules
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import EpisodeRules, evaluate
@@ -21,7 +25,8 @@ from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated, due_in_round
 from onedemo.training.runs import add_run, find_run
 from onedemo.training.simulated_run import train
-from onedemo.training.trainer import Trainer
+from onedemo.training.thread import Trainer
+from onedemo.training.training_run import TrainingRun
 from onedemo.vision.pose_estimator import regress
 
 
@@ -37,15 +42,27 @@ def store(tmp_path):
     store.close()
 
 
-def make_trainer(store, demo, simulated=None, config=None, name="r", encoder=None, watch=None):
+def make_run(store, demo, simulated=None, config=None, name="r", encoder=None, **options):
     data_dir = store.path.parent
     config = config or small_config()
     found = find_run(store, data_dir, demo, name=name, wanted=config)
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
-    return Trainer(
+    return TrainingRun(
         store=store, data_dir=data_dir, run=run, demo=demo, config=config, encoder=encoder or Thumbnail(),
-        simulated=simulated, watch=watch,
+        simulated=simulated, **options,
     )  # fmt: skip
+
+
+def work(training, iterations=10**6):
+    """Works on a run with a simulated rater until it is done, or stops asked after so many iterations."""
+    training.prepare()
+    while training.iteration < iterations and training.step() != "done":
+        pass
+    training.ask()
+
+
+def make_trainer(store, demo, **options):
+    return Trainer(make_run(store, demo, **options))
 
 
 def by_rule(segment, demo_step):
@@ -113,7 +130,7 @@ def test_the_same_seed_gives_the_same_run(demo, tmp_path):
     for name, threads in (("one", 2), ("two", 1)):
         torch.set_num_threads(threads)  # what the process had before must not matter
         store = Store(tmp_path / name)
-        make_trainer(store, demo, Simulated(name="rule", rate=by_rule)).work()
+        work(make_run(store, demo, Simulated(name="rule", rate=by_rule)))
         rows = store.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()
@@ -121,19 +138,10 @@ def test_the_same_seed_gives_the_same_run(demo, tmp_path):
 
 
 def test_a_stopped_run_goes_on_where_it_was(store, demo):
-    first: Trainer
-
-    def rate_and_stop(segment, demo_step):
-        if first.status().iteration >= 3:
-            first.stop()
-        return by_rule(segment, demo_step)
-
-    first = make_trainer(store, demo, Simulated(name="rule", rate=rate_and_stop))
-    first.work()
+    work(make_run(store, demo, Simulated(name="rule", rate=by_rule)), iterations=3)
     before = store.iterations("r")
-    assert 3 <= len(before) < 6 and first.status().phase == "stopped"
-    second = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
-    second.work()
+    assert len(before) == 3
+    work(make_run(store, demo, Simulated(name="rule", rate=by_rule)))
     after = store.iterations("r")
     assert after[: len(before)] == before
     assert [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
@@ -203,11 +211,77 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
     trainer_.stop()
 
 
+def held_by_another(path):
+    """Whether another process is refused a run's lock."""
+    program = (
+        f"from onedemo.core.files import hold\nwith hold(__import__('pathlib').Path({str(path)!r})): pass"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 or "another onedemo is working on" in done.stderr, done.stderr
+    return done.returncode != 0
+
+
+def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, demo):
+    """Amid an iteration of many seconds: a second process is refused, then so is this one, then nobody."""
+    config = small_config(rollouts__steps=6_000, rollouts__total_steps=10**9, ratings__pretrain=1)
+    training = make_run(store, demo, config=config)
+    with ExitStack() as held:
+        held.enter_context(hold(training.files.lock))
+        trainer_ = Trainer(training, held.pop_all())
+    ann = store.ensure_rater("Ann", "annotator")
+    trainer_.start()
+    wait_for(lambda: rate_all(store, "r", ann) or (trainer_.status().phase == "online"))
+    wait_for(lambda: trainer_.status().snapshot == 1)
+    trainer_.stop(timeout_s=0.01)
+    trainer_.release()
+    assert trainer_.status().phase == "online" and trainer_.status().iteration == 0
+    assert held_by_another(training.files.lock)
+    with pytest.raises(UserError, match="another onedemo is working on"), hold(training.files.lock):
+        pass
+    assert trainer_.status().iteration == 0  # all of that within the iteration
+    trainer_.stop()
+    assert trainer_.status().phase == "stopped" and trainer_.status().iteration == 1
+    assert not held_by_another(training.files.lock)
+
+
+def test_after_a_stop_that_timed_out_one_thread_follows_the_other(store, demo, monkeypatch):
+    """A run that is started again waits for the thread that has not ended; they never work side by side."""
+    working, at_once, go = [], [], threading.Event()
+    iterate = TrainingRun.iterate
+
+    def slow(self):
+        working.append(threading.current_thread())
+        at_once.append(len(working))
+        go.wait(20)
+        iterate(self)
+        working.pop()
+
+    monkeypatch.setattr(TrainingRun, "iterate", slow)
+    ann = store.ensure_rater("Ann", "annotator")
+    held = ExitStack()
+    freed = []
+    held.callback(lambda: freed.append(len(working)))
+    training = make_run(store, demo, config=small_config(rollouts__total_steps=10**6))
+    trainer_ = Trainer(training, held)
+    trainer_.start()
+    wait_for(lambda: rate_all(store, "r", ann) or working)
+    trainer_.stop(timeout_s=0.01)
+    trainer_.resume()
+    trainer_.stop(timeout_s=0.01)
+    trainer_.resume()
+    go.set()
+    wait_for(lambda: trainer_.status().iteration >= 3)
+    trainer_.stop()
+    assert set(at_once) == {1} and trainer_.status().phase == "stopped" and not freed
+    trainer_.release()
+    assert freed == [0]
+
+
 @pytest.fixture
 def few_wild(monkeypatch):
     """Random states are drawn and tried in seconds."""
     monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 4)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 200)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 200)
 
 
 @pytest.mark.slow
@@ -223,7 +297,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
             rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
         )
 
-    monkeypatch.setattr("onedemo.training.trainer.learn_appearance", look)
+    monkeypatch.setattr("onedemo.training.training_run.learn_appearance", look)
     trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
     trainer_.start()
     for _ in range(3):
@@ -246,7 +320,8 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     config = small_config(
         method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
     )
-    trainer_ = make_trainer(store, demo, config=config)
+    training = make_run(store, demo, config=config)
+    trainer_ = Trainer(training)
     trainer_.start()
     wait_for(lambda: trainer_.acting() is not None)
     before = trainer_.acting()
@@ -262,7 +337,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     one, two = trainer_.acting(), trainer_.acting()
     assert one is not None and two is not None and one.rules is not two.rules
     assert isinstance(one.rules, PracticeRules)
-    learner, snapshot = trainer_.final_policy()
+    learner, snapshot = training.learner, training.snapshot
     np.testing.assert_array_equal(one.policy.weights[0], learner.policy().weights[0])
     env = vector_env.make("hopper", 1, horizon=101, nthread=0)
     obs, _ = env.reset(seed=5)
@@ -272,7 +347,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     )  # fmt: skip
     clock = np.zeros(1, np.int32)
     for t in range(100):
-        step, _, clock = one.step(env, obs, clock, t)
+        step, clock = one.step(env, obs, clock)
         obs = step.next_obs
         assert clock[0] == expected.clock[0, t + 1]
     env.close()
@@ -314,23 +389,15 @@ def test_every_rating_asked_for_can_be_given(store, demo):
 
 def test_a_run_of_before_there_were_methods_goes_on(store, demo):
     """Its config names no method, its snapshots hold one network, its checkpoint no rules."""
-    first: Trainer
-
-    def rate_and_stop(segment, demo_step):
-        if first.status().iteration >= 3:
-            first.stop()
-        return by_rule(segment, demo_step)
-
-    first = make_trainer(store, demo, Simulated(name="rule", rate=rate_and_stop))
-    first.work()
+    first = make_run(store, demo, Simulated(name="rule", rate=by_rule))
+    work(first, iterations=3)
     before = store.iterations("r")
-    directory = first.directory
-    as_of_before(directory)
+    as_of_before(first.files.path)
     found = find_run(store, store.path.parent, demo, name="r", wanted=None)
     assert found is not None and found[1] == small_config()
-    second = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
-    assert second.status().method == "paper"
-    second.work()
+    second = make_run(store, demo, Simulated(name="rule", rate=by_rule))
+    assert Trainer(second).status().method == "paper"
+    work(second)
     after = store.iterations("r")
     assert after[: len(before)] == before and [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
 
@@ -350,20 +417,23 @@ def as_of_before(directory):
         torch.save(data, file)
     checkpoint = torch.load(directory / "checkpoint.pt", weights_only=True)
     del checkpoint["learner"]["rules"]
+    if checkpoint["pool"] is not None:
+        checkpoint["pool"]["env_rewards"] = checkpoint["pool"].pop("rewards")
     torch.save(checkpoint, directory / "checkpoint.pt")
 
 
 def test_a_run_leaves_no_temporary_file(store, demo):
-    trainer_ = make_trainer(store, demo, Simulated(name="rule", rate=by_rule))
-    trainer_.work()
-    files = [p.name for p in trainer_.directory.rglob("*") if p.is_file()]
+    training = make_run(store, demo, Simulated(name="rule", rate=by_rule))
+    work(training)
+    files = [p.name for p in training.files.path.rglob("*") if p.is_file()]
     assert not [name for name in files if name.startswith(".")]
 
 
 # Nothing that learns can reach the demo's hidden states.
 
 LEARNING = (
-    "training.trainer",
+    "training.training_run",
+    "training.thread",
     "training.learner",
     "reward.model",
     "reward.two_branch_net",
@@ -437,13 +507,13 @@ def watched_run(store, demo, config):
     _watching = True
     try:
         rater = Simulated(name="rule", rate=by_rule)
-        trainer_ = make_trainer(store, demo, rater, config=config, encoder=Mixed())
-        trainer_.work()
+        training = make_run(store, demo, rater, config=config, encoder=Mixed())
+        work(training)
     finally:
         _watching = False
     assert any(path.endswith("config.toml") or "checkpoint" in path for path in _opened)
     assert not [path for path in _opened if path.endswith(".hidden.npz")]
-    return trainer_
+    return training.learner, training.snapshot
 
 
 def learns_the_same_from_noise(demo, tmp_path, config):
@@ -453,13 +523,13 @@ def learns_the_same_from_noise(demo, tmp_path, config):
     rng = np.random.default_rng(0)
     fields = ("obs", "actions", "qpos", "qvel")
     noise = HiddenStates(**{f: rng.normal(size=getattr(truth, f).shape) for f in fields})
-    trainers, asked, arrays = [], [], []
+    ends, asked, arrays = [], [], []
     try:
         for name, hidden in (("truth", truth), ("noise", noise)):
             save_hidden(file, hidden)
             store = Store(tmp_path / name)
-            trainers.append(watched_run(store, demo, config))
-            learner, snapshot = trainers[-1].final_policy()
+            learner, snapshot = watched_run(store, demo, config)
+            ends.append((learner, snapshot))
             arrays.append([*learner.policy().weights, learner.policy().mean, *flat(snapshot.tensors())])
             asked.append([store.clip(i) for i in range(1, store.count_clips("r") + 1)])
             store.close()
@@ -468,7 +538,7 @@ def learns_the_same_from_noise(demo, tmp_path, config):
     assert asked[0] == asked[1] and len(asked[0]) >= 18  # the same clips, chosen alike
     for one, two in zip(*arrays, strict=True):
         np.testing.assert_array_equal(one, two)
-    return trainers[0].final_policy()
+    return ends[0]
 
 
 def flat(tree):
@@ -490,7 +560,7 @@ def few_pictures(monkeypatch):
     monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
     monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
     monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BANK_TRIES", 500)
+    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 500)
 
 
 ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
@@ -512,22 +582,15 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
     """What the robot looks like and the bank are made again, the running similarity is kept."""
     demo = drawn_demo(tmp_path / "demo")
     rater = Simulated(name="rule", rate=by_rule)
-    first: Trainer
-
-    def stop(learner, snapshot):
-        if learner.iteration == 2:
-            first.stop()
-
     curves = []
     for name, threads in (("whole", 1), ("stopped", 1), ("two", 2)):
         settings = {"ratings__online": 0, "rollouts__total_steps": 1600, "rollouts__threads": threads}
         config = small_config(**ONEDEMO, **settings)
         store = Store(tmp_path / name)
         if name == "stopped":
-            first = make_trainer(store, demo, rater, config=config, encoder=Mixed(), watch=stop)
-            first.work()
+            work(make_run(store, demo, rater, config=config, encoder=Mixed()), iterations=2)
             assert len(store.iterations("r")) == 2
-        make_trainer(store, demo, rater, config=config, encoder=Mixed()).work()
+        work(make_run(store, demo, rater, config=config, encoder=Mixed()))
         rows = store.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()

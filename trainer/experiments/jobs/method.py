@@ -192,7 +192,7 @@ class Watch:
         if learner.env_steps >= min(due, self._total_steps):
             episodes = perform(learner, snapshot)
             values = per_episode(episodes, self._oracle)
-            values["predicted_similarity"] = predicted_similarity(learner, snapshot, episodes)
+            values["predicted_similarity"] = predicted_similarity(episodes)
             self._last = episodes, values
             self._curve["env_steps"].append(learner.env_steps)
             for name in CURVES:

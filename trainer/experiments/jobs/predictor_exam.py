@@ -17,7 +17,7 @@ from onedemo.annotators.oracle import Oracle
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.experiments.predictor_scores import spearman
 from onedemo.queries.selection import choose
-from onedemo.reward.episode_rules import fill_bank
+from onedemo.reward.episode_rules import fill_reset_buffer
 from onedemo.reward.model import Snapshot
 from onedemo.rl.random_states import HeldNoise
 from onedemo.sim import vector_env
@@ -95,7 +95,7 @@ class Exam:
             )
 
         rng = np.random.default_rng([_STREAM, self._seed, 1])  # the same tries for all predictors
-        bank = fill_bank(snapshot, self._wild, frames_of, self._learner.demo_steps, rng)
+        bank = fill_reset_buffer(snapshot, self._wild, frames_of, self._learner.demo_steps, rng)
         picked = [
             self._oracle.distance(qpos[None], qvel[None], int(step))[0]
             for qpos, qvel, step in zip(bank.qpos, bank.qvel, bank.clock, strict=True)

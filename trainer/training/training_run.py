@@ -1,0 +1,298 @@
+"""One training, step by step: ask for ratings, refit the reward model, improve the policy, keep it all.
+
+The way of one rating: it is in the database -> before the next iteration a new event is seen -> refit ->
+snapshot N on disk and in the database -> N scores the whole iteration -> TRPO step -> checkpoint -> new
+clips are cut from the newest rollouts.
+
+No thread and no waiting is in here: ``simulated_run.train`` calls ``step`` until the run is done,
+``thread.Trainer`` works at the pace of people.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from onedemo.config import RunConfig
+from onedemo.core.files import read_whole
+from onedemo.demos.library import read_frames
+from onedemo.render.renderer import RenderThread
+from onedemo.reward.dataset import TrainingSet
+from onedemo.reward.model import Snapshot
+from onedemo.reward.warm_start import keep_start
+from onedemo.rl.policy import PolicySnapshot
+from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
+from onedemo.sim import vector_env
+from onedemo.sim.task_rewards import TASK_REWARDS
+from onedemo.storage.run_directory import RunDirectory
+from onedemo.storage.store import Store
+from onedemo.training.best_rollouts import Gallery
+from onedemo.training.checkpoint import load_checkpoint, save_checkpoint
+from onedemo.training.clip_worker import ClipMaker
+from onedemo.training.comparison_queue import Pairing
+from onedemo.training.learner import Learner
+from onedemo.training.rating_queue import Asking, Simulated
+from onedemo.types import Demo, Rollouts
+from onedemo.vision.encoders import Encoder, demo_features
+from onedemo.vision.pose_estimator import Track
+from onedemo.vision.pose_estimator import learn as learn_appearance
+
+
+class TrainingRun:
+    """One run: what it learns, its files, its place in the database. One thread at a time works on it.
+
+    Other threads may read its attributes, and call ``acting``, ``want_pairs`` and ``rollout_file``.
+
+    Args:
+        store: Shared with the page.
+        data_dir: ``runs/<run>/`` and the feature cache are in it.
+        run: Name of the run, recorded in the store already.
+        demo: What is to be learned.
+        config: The run's settings.
+        encoder: Looks at the demo's frames, once.
+        renderer: Draws clips for people; None if nobody looks.
+        simulated: Answers in place of people; None for people.
+        cache_dir: Holds what is known of demos and robots for any run; the data directory if None.
+        watch: Called after each iteration.
+        start: Snapshot of another run that this one's predictor starts from; a copy is kept, so a resumed
+            run needs none.
+    """
+
+    def __init__(
+        self,
+        *,
+        store: Store,
+        data_dir: Path,
+        run: str,
+        demo: Demo,
+        config: RunConfig,
+        encoder: Encoder,
+        renderer: RenderThread | None = None,
+        simulated: Simulated | None = None,
+        cache_dir: Path | None = None,
+        watch: Callable[[Learner, Snapshot], None] | None = None,
+        start: Path | None = None,
+    ) -> None:
+        self.store, self.run, self.demo, self.config = store, run, demo, config
+        self.data_dir = data_dir
+        self.files = RunDirectory(data_dir, run)
+        self.dt = vector_env.spec(config.env).dt
+        """Seconds of a control step."""
+        self.queue = Asking(store, run, config, simulated)
+        """The clips that are put to annotators."""
+        self.learner: Learner | None = None
+        """None until ``open``."""
+        self.snapshot: Snapshot | None = None
+        """The newest; None before the first fit."""
+        self.iteration = self.env_steps = 0
+        """Of the last iteration that is in the database."""
+        self.steps_per_s = 0.0
+        """Control steps per second in the last iteration."""
+        self.preparing = "Looking at the video for the first time."
+        """What ``look`` does, one sentence."""
+        self._encoder, self._renderer = encoder, renderer
+        self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
+        self._gallery = None
+        if renderer is not None:
+            self._gallery = Gallery(self.files.rollouts, demo, self.dt, renderer)
+        self._pairing: Pairing | None = None
+        self._training_set = TrainingSet(store, run, self.dt)
+        self._fitted_event = 0
+        self._pool: Rollouts | None = None
+        self._policy: PolicySnapshot | None = None
+
+    # Preparing
+
+    def prepare(self) -> None:
+        """Opens the run and looks at the demo: all that comes before the first ``step``."""
+        self.open()
+        self.see(*self.look())
+
+    def open(self) -> None:
+        """Takes up the run where its checkpoint is, or at its beginning; from then on ``ask`` works.
+
+        Raises:
+            UserError: If the demo, the device or the predictor to start from do not fit.
+        """
+        # The networks that learn are too small to be split: threads would wait for each other more than
+        # they compute, the longer the busier the machine. Their first weights depend on the number, too.
+        torch.set_num_threads(1)
+        begun = bool(self.store.snapshots(self.run))
+        start = keep_start(self.files, self._start, begun=begun)
+        first = Snapshot.load(start, self.config.device) if start is not None else None
+        learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
+        if not self._load_checkpoint(learner):
+            self._pool = learner.random_rollouts()
+        self.learner, self.iteration, self.env_steps = learner, learner.iteration, learner.env_steps
+        self._load_snapshot()
+        if self._renderer is not None:
+            frames = read_frames(self.demo)
+            self.queue.clips = ClipMaker(
+                self.store, file=self.files.clip, frames=frames, frames_of=learner.frames_of,
+                renderer=self._renderer,
+            )  # fmt: skip
+            self._pairing = Pairing(
+                self.store, self.run, self.files.pair, frames, self._renderer, self.config.seed
+            )
+            self.queue.clips.recover(self.run)
+
+    def look(self, check: Callable[[], None] = lambda: None) -> tuple[np.ndarray, Track | None]:
+        """Looks at the demo, and at the robot if asked for: a minute or more the first time.
+
+        Another thread than the one that asks may do it.
+
+        Args:
+            check: Called now and then; may raise to end it.
+
+        Returns:
+            Features of the demo's frames, (F, D), and what they show of the robot, if that can be told.
+        """
+        torch.set_num_threads(self.config.rollouts.threads)
+        features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
+        if not self.config.predictor.appearance:
+            return features, None
+        self.preparing = "Looking at pictures of the robot: about a minute, the first time only."
+        look = learn_appearance(self.config.env, self._encoder, self._cache_dir / "robots", check)
+        return features, look.track(features, self.demo.fps) if look.knows(features) else None
+
+    def see(self, features: np.ndarray, track: Track | None) -> None:
+        """Takes in what ``look`` found; from then on ``refit`` and ``iterate`` work."""
+        torch.set_num_threads(1)
+        self._opened.look_at(features, track)
+        self._policy = self._opened.policy()
+
+    # Working
+
+    @property
+    def phase(self) -> str:
+        """What comes next: "pretrain" (ratings, before the policy is trained), "online" or "done"."""
+        if self._opened.env_steps >= self.config.rollouts.total_steps:
+            return "done"
+        early = self._opened.iteration == 0 and self.queue.given() < self.config.ratings.pretrain
+        return "pretrain" if early else "online"
+
+    def step(self) -> str:
+        """Asks, then refits or makes an iteration, whichever is due; the phase that it found.
+
+        For simulated annotators, who answer within it: while people have yet to rate, nothing happens.
+        """
+        self.ask()
+        phase = self.phase
+        if phase == "pretrain":
+            self.refit()
+        elif phase == "online":
+            self.iterate()
+        return phase
+
+    def ask(self) -> None:
+        """Fills the queues of clips and pairs; simulated annotators answer at once."""
+        self.queue.fill(self._opened, self._pool, self.snapshot)
+        if self._pairing is not None:
+            self._pairing.fill(self._opened, self._pool)
+
+    def refit(self, at_least: int = 1) -> bool:
+        """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
+        event = self.store.last_event()
+        if event == self._fitted_event or event - self._fitted_event < at_least:
+            return False
+        ratings = self._training_set.at(event)
+        if not ratings:
+            return False
+        number = (self.snapshot.number if self.snapshot else 0) + 1
+        snapshot, stats = self._opened.fit(ratings, number)
+        snapshot.save(self.files.snapshot(number))
+        self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
+        self.snapshot, self._fitted_event = snapshot, event
+        self.queue.predict_waiting(self._opened, snapshot)
+        return True
+
+    def iterate(self) -> None:
+        """One iteration with the newest ratings, and all that is kept of it."""
+        began = time.monotonic()
+        self.refit()
+        learner, snapshot = self._opened, self.snapshot
+        assert snapshot is not None, "the policy is trained on a snapshot"
+        before = learner.env_steps
+        rollouts, stats = learner.iterate(snapshot)
+        stats |= self._true_reward(rollouts)
+        if self._gallery is not None:
+            stats |= self._gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
+        stats["steps_per_s"] = (learner.env_steps - before) / (time.monotonic() - began)
+        self._pool, self._policy = rollouts, learner.policy()
+        row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
+        left = self.queue.given() < self.queue.target
+        save_checkpoint(self.files.checkpoint, learner.state_dict(), row, rollouts if left else None)
+        self.store.add_iteration(self.run, learner.iteration, **row)
+        self.queue.withdraw_stale(learner.iteration)
+        self.iteration, self.env_steps = learner.iteration, learner.env_steps
+        self.steps_per_s = stats["steps_per_s"]
+        if self._watch is not None:
+            self._watch(learner, snapshot)
+
+    # What other threads may call
+
+    def acting(self) -> Acting | None:
+        """The newest policy beside the demo as the newest snapshot moves it; None until there is a policy.
+
+        What the caller gets is its own and does not change: ask again for each episode.
+        """
+        learner, policy, snapshot = self.learner, self._policy, self.snapshot
+        if learner is None or policy is None:
+            return None
+        rules = learner.rules(1, snapshot) if snapshot is not None else EpisodeRules()
+        return Acting(policy=policy, rules=rules)
+
+    def want_pairs(self) -> None:
+        """Somebody would compare pairs: some are made while this is said every few seconds."""
+        if self._pairing is not None:
+            self._pairing.want()
+
+    def rollout_file(self, iteration: int, suffix: str) -> Path:
+        """The best rollout of an iteration, as ``Gallery.file``.
+
+        Raises:
+            FileNotFoundError: If none was kept.
+        """
+        if self._gallery is None:
+            raise FileNotFoundError(f"nothing of iteration {iteration} was kept")
+        return self._gallery.file(iteration, suffix)
+
+    # Helpers
+
+    @property
+    def _opened(self) -> Learner:
+        assert self.learner is not None, "open() comes first"
+        return self.learner
+
+    def _true_reward(self, rollouts: Transitions) -> dict[str, float]:
+        """The hand-coded reward where the demo's task has one: shown, never learned from."""
+        if self.demo.task not in TASK_REWARDS:
+            return {}
+        reward = TASK_REWARDS[self.demo.task](
+            rollouts.next_obs, rollouts.actions, rollouts.qpos, rollouts.next_qpos, rollouts.next_qvel
+        )
+        return {"true_reward": float(reward.mean() * self._opened.demo_steps)}
+
+    def _load_snapshot(self) -> None:
+        """The newest snapshot that the database knows and the disk holds whole."""
+        for row in reversed(self.store.snapshots(self.run)):
+            file = self.files.snapshot(row["number"])
+            if read_whole(file) is not None:
+                self.snapshot = Snapshot.load(file, self.config.device)
+                self._fitted_event = row["last_event"]
+                return
+
+    def _load_checkpoint(self, learner: Learner) -> bool:
+        saved = load_checkpoint(self.files.checkpoint)
+        if saved is None:
+            return False
+        state, row, self._pool = saved
+        learner.load_state_dict(state)
+        # The process may have died between the file and the row.
+        self.store.add_iteration(self.run, learner.iteration, **row)
+        return True
