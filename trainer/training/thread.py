@@ -155,7 +155,7 @@ class Trainer:
             if before is not None:
                 before.join()
             give_way()  # people at the page come first
-            while not stop.is_set():
+            while True:
                 try:
                     self._work(stop)
                 except _Stopped:
@@ -163,6 +163,8 @@ class Trainer:
                 except Exception as error:
                     log.exception("run %s: the trainer failed", self.run)
                     self._rest_after(error, stop)
+                if stop.is_set():  # not before: what a run starts from is kept even if it is stopped at once
+                    break
         finally:
             with self._control:
                 self._working -= 1
