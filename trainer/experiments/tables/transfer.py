@@ -129,8 +129,8 @@ def _pairs(groups: Groups) -> dict[tuple[Direction, str, str], _Pair]:
     return pairs
 
 
-def _goals(groups: Groups) -> Iterable[Block]:
-    """Over the means of the seeds."""
+def goals(groups: Groups) -> Iterable[Block]:
+    """A table of them, over the means of the seeds."""
     rows = []
     for (way, method, name), pair in _pairs(groups).items():
         what, both = f"{way.title}, {method}, {name}", (str(pair.tuned), str(pair.scratch))
@@ -246,7 +246,7 @@ TABLE = parts.Experiment(
     parts=[
         Text(_INTRODUCTION),
         Heading("What should be reached"),
-        _goals,
+        goals,
         *_direction(
             THERE, "Hopping from a predictor of the backflip", _HOPS, _EACH_HOP,
             ("hop_curve", "hopping return"), _papers_table,
