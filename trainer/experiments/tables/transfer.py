@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.jobs.transfer import transfer_job
 from onedemo.experiments.report.blocks import Block, Heading, Table, Text, number
-from onedemo.experiments.runner import Job
+from onedemo.experiments.runner import Job, Outcome
 from onedemo.experiments.statistics import Spread, spread, spread_of
 from onedemo.experiments.tables import parts
 from onedemo.experiments.tables.episode import BESIDE, Episode
@@ -107,6 +107,10 @@ class _Pair:
         return "open" if self.tuned.missing or self.scratch.missing else "**met**" if met else "missed"
 
 
+def _by_seed(outcomes: Sequence[Outcome], pick: Pick) -> dict[int, float | None]:
+    return {o.job.seed: None if o.result is None else pick(o.result) for o in outcomes}
+
+
 def _pairs(groups: Groups) -> dict[tuple[Direction, str, str], _Pair]:
     """By direction, method and figure; those of which one half was not planned are left out."""
     pairs = {}
@@ -116,16 +120,14 @@ def _pairs(groups: Groups) -> dict[tuple[Direction, str, str], _Pair]:
             pick = figure(name, way.part)
             for method, two in labels.items():
                 if all(label in groups for label in two):
-                    tuned, scratch = (
-                        {o.job.seed: o.result and pick(o.result) for o in groups[label]} for label in two
-                    )
+                    tuned, scratch = (groups[label] for label in two)
+                    less = _by_seed(scratch, pick)
                     ratios = [
-                        value / less if value is not None and (less := scratch.get(seed) or 0) > 0 else None
-                        for seed, value in tuned.items()
+                        value / base if value is not None and (base := less.get(seed) or 0) > 0 else None
+                        for seed, value in _by_seed(tuned, pick).items()
                     ]
-                    pairs[way, method, name] = _Pair(
-                        *(spread(groups[label], pick) for label in two), spread_of(ratios)
-                    )
+                    pair = _Pair(spread(tuned, pick), spread(scratch, pick), spread_of(ratios))
+                    pairs[way, method, name] = pair
     return pairs
 
 
