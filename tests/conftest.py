@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Finished runs of all tables, so that demo and robot are looked at once, and runs are shared.
+    """Where runs of the tests are kept, with a cache of what they share: robot and demos are looked at once.
 
     The robot is learned from fewer pictures than it is for people: a minute less.
     """
@@ -32,9 +32,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from onedemo.vision.encoders import make_encoder
 
     directory = tmp_path_factory.mktemp("results")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_estimator, "PICTURES", 1000)
-        pose_estimator.learn("hopper", make_encoder("efficientnet-lite0"), directory / "cache" / "robots")
+    encoder = make_encoder("efficientnet-lite0")
+    pose_estimator.learn("hopper", encoder, directory / "cache" / "robots", count=600)
     return directory
 
 

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.experiments.report.blocks import Chart, Document, Table, Text
-from onedemo.experiments.runner import Job, by_label
-from onedemo.experiments.statistics import band, spread
-
-TITLE = "onedemo: a tiny table"
-SEEDS = 3
+from onedemo.experiments.report.blocks import Text
+from onedemo.experiments.runner import Job
+from onedemo.experiments.tables import parts
 
 
 def plan(seeds, *, quick):
@@ -30,17 +27,21 @@ def plan(seeds, *, quick):
     ]
 
 
-def report(outcomes, *, quick):
-    """Its report."""
-    rows, lines = [], []
-    for label, group in by_label(outcomes).items():
-        height = spread(group, lambda result: result["height"])
-        rows.append((label, str(height), height.each))
-        curves = [(o.result["curve"]["step"], o.result["curve"]["height"]) for o in group if o.result]
-        lines += [band(curves).line(label)] if curves else []
-    chart = Chart(name="heights", title="Heights", x_label="steps", y_label="height, m", lines=lines)
-    blocks = [Text("How high."), Table(heads=("method", "height, m", "each seed"), rows=rows)]
-    return Document(title=TITLE, blocks=blocks + [chart] * bool(lines), data={"rows": rows})
+def height(result):
+    """How high it got."""
+    return result["height"]
+
+
+TABLE = parts.Experiment(
+    title="onedemo: a tiny table",
+    seeds=3,
+    plan=plan,
+    parts=[
+        Text("How high."),
+        parts.Figures({"height, m": height, "each seed": (height, parts.each)}, head="method"),
+        parts.Curves("height", "heights", "Heights", "height, m"),
+    ],
+)
 
 
 def climb(settings, seed, scratch):
@@ -51,7 +52,7 @@ def climb(settings, seed, scratch):
             file.write(f"{seed}\n")
     steps = np.arange(settings["steps"])
     heights = settings["slope"] * steps + seed
-    curve = {"step": steps, "height": heights, "nothing": np.full(3, np.nan)}
+    curve = {"env_steps": steps, "height": heights, "nothing": np.full(3, np.nan)}
     return {"height": heights[-1], "curve": curve, "threads": os.environ["OMP_NUM_THREADS"]}
 
 

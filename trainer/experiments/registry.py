@@ -1,44 +1,18 @@
-"""The tables of the paper and ours, by name, and what a table is. Light: the command line reads it."""
+"""The tables of the paper and ours, by name. Light: the command line reads it."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from onedemo.experiments.report.document import Document
-    from onedemo.experiments.runner import Job, Outcome
+    from onedemo.experiments.tables.parts import Experiment
 
 TUNING_FROM = 100
 """Settings are tuned on seeds from here on, which no table reports; reports take 0, 1, 2 and so on."""
 
-
 _MOST_SEEDS = 1000
-
-
-class Table(Protocol):
-    """What a module of a table has.
-
-    It runs nothing itself: ``plan`` says what is to be run, ``report`` makes a report of what there is.
-    """
-
-    TITLE: str
-    """Of its report."""
-    SEEDS: int
-    """How many of the reporting seeds it takes when none are given; quick forms take at most two."""
-
-    def plan(self, seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
-        """The jobs, most wanted first. Quick: under 5 minutes on two cores, with two seeds."""
-        ...
-
-    def report(self, outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-        """Of one outcome for each job of the plan, in order. Any of them may have no result.
-
-        It need not say what was typed, on which machine, and which runs are missing: ``account`` does.
-        """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +20,7 @@ class Entry:
     """A table that can be asked for."""
 
     module: str
-    """Satisfies ``Table``."""
+    """Its ``TABLE`` is the ``Experiment``."""
     summary: str
 
 
@@ -63,14 +37,14 @@ TABLES = {
 """``onedemo bench NAME``; a new table is one module and one line here."""
 
 
-def find_table(name: str) -> Table:
-    """The module of a table."""
-    return cast(Table, importlib.import_module(TABLES[name].module))
+def find_table(name: str) -> Experiment:
+    """What a table is made of."""
+    return importlib.import_module(TABLES[name].module).TABLE
 
 
-def default_seeds(table: Table, *, quick: bool) -> tuple[int, ...]:
+def default_seeds(table: Experiment, *, quick: bool) -> tuple[int, ...]:
     """The seeds a table takes when none are given."""
-    return tuple(range(min(2, table.SEEDS) if quick else table.SEEDS))
+    return tuple(range(min(2, table.seeds) if quick else table.seeds))
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

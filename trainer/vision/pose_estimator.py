@@ -108,7 +108,10 @@ def _go_on() -> None:
     """Lets everything run to its end."""
 
 
-def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on) -> Appearance:
+def learn(
+    env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on, *,
+    count: int | None = None,
+) -> Appearance:  # fmt: skip
     """Learns what the robot looks like, or takes what was learned before.
 
     Args:
@@ -116,6 +119,7 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], 
         encoder: Looks at the pictures.
         cache_dir: Where it is kept, by robot and encoder.
         check: Called every now and then; what it raises ends the learning.
+        count: Pictures to learn from, where it is not known yet; ``PICTURES`` if None.
 
     Raises:
         UserError: If this machine cannot draw.
@@ -126,7 +130,7 @@ def learn(env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], 
     if (data := read_whole(path)) is not None:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return Appearance(stored)
-    appearance = regress(*pictures(env_name, encoder, PICTURES, check), check)
+    appearance = regress(*pictures(env_name, encoder, count or PICTURES, check), check)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)
     write_atomic(path, buffer.getvalue())

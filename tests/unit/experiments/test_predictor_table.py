@@ -1,4 +1,4 @@
-"""Table 1: its scores against known answers, its report from made-up results, and a small trial for real."""
+"""Table 1: its scores against known answers, and its report from made-up results."""
 
 import json
 
@@ -21,9 +21,15 @@ from onedemo.experiments.report import document
 from onedemo.experiments.report.blocks import Bars, Bullets, Chart, Table
 from onedemo.experiments.runner import Outcome, kind_of
 from onedemo.experiments.tables import predictor
-from onedemo.experiments.tables.predictor_figures import PAPER, TEST, findings
+from onedemo.experiments.tables.predictor_figures import (
+    COUNTED,
+    PAPER,
+    PAPERS_CHOICE,
+    by_variant,
+    findings,
+    paired,
+)
 from onedemo.experiments.worker import find_function
-from onedemo.vision import pose_estimator
 
 # Scores
 
@@ -142,7 +148,7 @@ def test_what_cannot_be_told_apart_is_said_loudly():
     def noisy(name, seed):
         return {"test": 0.6 + noise[list(VARIANTS).index(name), seed]}
 
-    group = [o for o in outcomes(range(5), noisy) if o.job.settings["data"] == "paper"]
+    group = by_variant([o for o in outcomes(range(5), noisy) if o.job.settings["data"] == "paper"])
     first, _, high, *_ = findings("x", group)
     assert "**less than the spread of one variant over seeds" in first
     assert "**Seed by seed, none can be told from the additional layer.**" in first
@@ -151,18 +157,19 @@ def test_what_cannot_be_told_apart_is_said_loudly():
     def worse(name, seed):
         return {"test": 0.3 + seed / 10 - 0.2 * (name == "class weights") + noise[0, seed] / 100}
 
-    group = [o for o in outcomes(range(5), worse) if o.job.settings["data"] == "paper"]
+    made = [o for o in outcomes(range(5), worse) if o.job.settings["data"] == "paper"]
+    group = by_variant(made)
     assert findings("x", group)[0].endswith("told from the additional layer: class weights.")
-    assert TEST.paired(group, "class weights") == pytest.approx([-20] * 5)
-    assert "nothing can be said" in findings("x", group[:1])[0]
+    assert paired(COUNTED["test"], group["class weights"], group[PAPERS_CHOICE]) == pytest.approx([-20] * 5)
+    assert "nothing can be said" in findings("x", by_variant(made[:1]))[0]
 
 
 def test_the_report_shows_every_seed_and_every_predictor():
     made = outcomes((0, 1, 2), lambda name, seed: {"test": 0.5 + seed / 10}, missing=(1,))
-    report = predictor.report(made, quick=False)
+    report = predictor.TABLE.report(made, quick=False)
     tables = [block for block in report.blocks if isinstance(block, Table)]
     each = [table for table in tables if table.title == "Each seed, in the order 0, 1, 2"]
-    assert each[0].rows[0][:2] == ["random sampling", "50, –, 70"]
+    assert each[0].rows[0][:2] == ("random sampling", "50, –, 70")
     accuracy = next(table for table in tables if table.title == "Clips not fitted, %")
     assert [row[0] for row in accuracy.rows] == [*VARIANTS, "always the same"]
     assert (
@@ -181,41 +188,6 @@ def test_the_report_shows_every_seed_and_every_predictor():
 
 
 def test_the_report_of_nothing():
-    report = predictor.report(outcomes((0, 1), missing=(0, 1)), quick=True)
+    report = predictor.TABLE.report(outcomes((0, 1), missing=(0, 1)), quick=True)
     assert next(block for block in report.blocks if isinstance(block, Bullets)).items == []
     assert "not run" not in document.as_text(report)
-
-
-# A trial
-
-
-@pytest.mark.seam
-def test_a_quick_trial_of_both_kinds_of_ratings(tmp_path, monkeypatch):
-    # A rougher idea of the robot's looks than the product has: learned from a tenth of the pictures.
-    monkeypatch.setattr(pose_estimator, "PICTURES", 400)
-    made = []
-    for job in predictor.plan((100,), quick=True):
-        result = document.plain(run(dict(job.settings), job.seed, tmp_path / "scratch", tmp_path / "cache"))
-        made.append(Outcome(job=job, kept={"result": result}))
-        for classes, count in zip(result["classes"].values(), (200, 100, 100), strict=True):
-            assert sum(classes) == count
-        assert list(result["variants"]) == list(VARIANTS)
-        for figures in result["variants"].values():
-            assert np.sum(figures["confusion"]) == 200 and np.sum(figures["reliability"][0]) == 200
-            right = np.trace(figures["confusion"]) / 200
-            assert right == pytest.approx((figures["validation"] + figures["test"]) / 2)
-            assert 1 <= figures["shuffled"] <= 5 and -1 <= figures["ranks"][OTHERS] <= 1
-        assert result["truth"]["shuffled"] < 2.5
-        # Attempts at the move are nearer to it than other moves.
-        assert result["truth"]["clips"][ATTEMPTS] > result["truth"]["clips"][OTHERS] + 0.3
-        metric, network = result["variants"]["metric"], result["variants"]["additional layer"]
-        assert metric["own"] > metric["shuffled"] + 1
-        assert metric["own"] - metric["shuffled"] > network["own"] - network["shuffled"] + 0.5
-        assert metric["ranks"][ATTEMPTS] > max(0.6, network["ranks"][ATTEMPTS])
-        assert metric["picked"] > network["picked"] + 0.5
-    skewed, asked = (sum(o.result["classes"]["fitted"][2:]) for o in made)
-    assert skewed + 10 < asked  # a random policy from standing hardly shows anything that deserves a 3
-    assert not (tmp_path / "scratch").exists()  # what was learned of demo and robot is in the cache
-    report = predictor.report(made, quick=True)
-    document.write(report, tmp_path / "report")
-    assert (tmp_path / "report" / "reliability-random-policy.svg").exists()

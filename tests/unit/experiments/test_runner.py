@@ -303,10 +303,9 @@ def test_a_table_from_command_to_report(tiny_table, capsys):
 def test_a_run_that_failed_fails_the_command(tiny_table, monkeypatch, capsys):
     from helpers import tiny_jobs
 
-    monkeypatch.setattr(
-        tiny_jobs, "plan", lambda seeds, quick: [job(1, kind="helpers.tiny_jobs:falls", label="fall")]
-    )
-    monkeypatch.setattr(tiny_jobs, "report", lambda outcomes, quick: tiny_jobs.Document(title="x", blocks=[]))
+    failing = [job(1, kind="helpers.tiny_jobs:falls", label="fall")]
+    table = replace(tiny_jobs.TABLE, plan=lambda seeds, quick: failing, parts=[])
+    monkeypatch.setattr(tiny_jobs, "TABLE", table)
     assert main(["bench", "tiny"]) == 1
     assert "seed 1 failed: RuntimeError: fell at step 1" in capsys.readouterr().out
 

@@ -1,4 +1,4 @@
-"""The tables of transfer and of the person: plans, ratios, strips, and their quick forms for real."""
+"""The tables of transfer and of the person: plans, ratios, strips."""
 
 import cv2
 import numpy as np
@@ -7,31 +7,19 @@ import pytest
 from onedemo.app.cli.main import main
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import find_demo
-from onedemo.errors import UserError
 from onedemo.evaluation.metrics import farthest_turn, net_turns, turned
 from onedemo.experiments.jobs import person
 from onedemo.experiments.jobs.method import run_config
 from onedemo.experiments.report import document
 from onedemo.experiments.report.strip import moments, strip
 from onedemo.experiments.runner import Job, Outcome
-from onedemo.experiments.tables import person as person_table
 from onedemo.experiments.tables import transfer
 from onedemo.experiments.tables.transfer import BACK, THERE
-from unit.experiments.test_tables import run
-
-SEED = 101  # not one of those that are reported
 
 
 @pytest.fixture
 def no_video(monkeypatch, tmp_path):
     monkeypatch.setenv(person.VARIABLE, str(tmp_path / "nowhere.mp4"))
-
-
-def has_video():
-    try:
-        return bool(person.video())
-    except UserError:
-        return False
 
 
 def test_rotation_is_counted_with_its_sign():
@@ -71,6 +59,12 @@ def outcome(label, seed, **figures):
     return Outcome(job=job, kept={"result": result})
 
 
+def goals(groups):
+    """Rows of the table of goals."""
+    (table,) = transfer.goals(groups)
+    return table.rows
+
+
 def test_the_ratio_is_that_of_the_same_seeds():
     tuned, scratch = (THERE.label("onedemo", t) for t in (True, False))
     found = [
@@ -78,21 +72,27 @@ def test_the_ratio_is_that_of_the_same_seeds():
         outcome(scratch, 1, hop_return=200.0), outcome(scratch, 0, hop_return=300.0),
     ]  # fmt: skip
     groups = {label: [o for o in found if o.job.label == label] for label in (tuned, scratch)}
-    rows = {row[:2]: row for row in transfer._goals(groups).rows}
+    rows = {row[:2]: row for row in goals(groups)}
     name = "backflip to hop, onedemo, hop_return"
     assert rows[name, "1.5 x scratch"][4:] == ("1.8", "1, 3", "**met**")
     assert rows[name, "beyond: 767"][-1] == "**met**"  # 900: best of 16, mean over seeds
     assert rows["backflip to hop, onedemo, hop_reward", "1.5 x scratch"][-1] == "missed"
+    for tuned_mean, scratch_mean in ((300.0, -100.0), (300.0, 0.0)):  # no ratio to nothing, or to less
+        pair = {
+            label: [outcome(label, 0, hop_return=mean)]
+            for label, mean in ((tuned, tuned_mean), (scratch, scratch_mean))
+        }
+        assert goals(pair)[0][4:] == ("–", "–", "missed")
     missing = Outcome(job=Job(kind="method", label=tuned, settings={}, seed=2), reason="not run")
     groups[tuned].append(missing)
-    assert transfer._goals(groups).rows[0][-1] == "open"
+    assert goals(groups)[0][-1] == "open"
     back = outcome(BACK.label("paper", True), 0)
-    assert transfer._goals({back.job.label: [back]}).rows == []  # nothing to compare it with
+    assert goals({back.job.label: [back]}) == []  # nothing to compare it with
 
 
 def test_the_papers_figures_stand_beside_ours():
     planned = transfer.plan((0,), quick=False)
-    report = transfer.report([Outcome(job=job, reason="not run") for job in planned], quick=False)
+    report = transfer.TABLE.report([Outcome(job=job, reason="not run") for job in planned], quick=False)
     text = document.as_text(report)
     assert "767" in text and "1,007" in text and "433" in text and "not run" in text
 
@@ -119,34 +119,3 @@ def test_a_strip_shows_the_same_moments_of_both(tmp_path):
     assert (one, two) == (60, 179)
     with pytest.raises(ValueError, match="3 positions do not go with the 240 frames"):
         strip(demo, hidden.qpos[:3])
-
-
-@pytest.mark.seam
-def test_transfer(results, tmp_path):
-    found, text = run(transfer, results, tmp_path)
-    tuned, scratch = (found[THERE.label("onedemo", t)] for t in (True, False))
-    assert tuned["ratings"] == scratch["ratings"] == 20 and tuned["source"]["ratings"] == 40
-    assert tuned["curve"]["env_steps"] == scratch["curve"]["env_steps"]
-    assert tuned["figures"]["hop_return"] != scratch["figures"]["hop_return"]
-    # What the backflip taught of the rater holds for the hop: its own states are rated well.
-    assert tuned["demo_rated"] > tuned["demo_shuffled"] + 0.1
-    assert tuned["demo_rated"] > 3
-    assert "767" in text and (tmp_path / "hop_fine_tuned.webp").exists()
-
-
-@pytest.mark.seam
-def test_person(results, tmp_path):
-    if not has_video():
-        pytest.skip(f"{person.VARIABLE} names no video")
-    found, text = run(person_table, results, tmp_path)
-    ours = found["onedemo"]
-    assert ours["ratings"] == 30 and len(ours["ratings_by_class"]) == 5
-    assert sum(n > 0 for n in ours["ratings_by_class"]) >= 3, "the rater tells clips apart"
-    assert len(ours["episode"]["qpos"]) == 66 and ours["demo_rated"] is None
-    each = ours["figures"]["farthest_turn"]["each"]
-    assert len(each) == 16 and all(
-        far >= abs_ for far, abs_ in zip(each, ours["figures"]["turned"]["each"], strict=True)
-    )
-    assert "net turns" in text
-    for name in ("person_onedemo.webp", "person_onedemo_strip.webp"):
-        assert (tmp_path / name).stat().st_size > 10_000

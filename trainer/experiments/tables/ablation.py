@@ -11,24 +11,12 @@ from typing import Any
 
 from onedemo.config import METHODS, RunConfig
 from onedemo.experiments.jobs.method import method_job
-from onedemo.experiments.report.blocks import (
-    Bars,
-    Block,
-    Cell,
-    Document,
-    Heading,
-    Reference,
-    Table,
-    Text,
-    number,
-)
-from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.report.blocks import Reference, number
+from onedemo.experiments.runner import Job, Outcome
 from onedemo.experiments.statistics import spread
-from onedemo.experiments.tables import backflip
-from onedemo.experiments.tables.summary import Groups, figure
+from onedemo.experiments.tables import backflip, parts
+from onedemo.experiments.tables.parts import Groups, Pick, columns, figure
 
-TITLE = "onedemo: what each part contributes"
-SEEDS = 3
 STEPS = 500_000
 """Control steps of practice: fewer than in the other tables, where learning is steepest."""
 RATINGS = 350
@@ -105,59 +93,55 @@ def on(keys: Sequence[str]) -> dict[str, Any]:
     return values
 
 
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """What is lost without each part, and what each gives to the paper's method."""
-    groups = by_label(outcomes)
-    settings = outcomes[0].job.settings
-    seeds = len(groups[_OURS])
-    blocks: list[Block] = [
-        Text(
-            f"The tumbling demo of 8 s, {settings['ratings']} ratings of a rater without error. **{seeds} "
-            f"{'seed' if seeds == 1 else 'seeds'} and {settings['steps']:,} control steps of practice**: "
-            f"fewer than in the table of methods (5 seeds, {backflip.STEPS:,} steps). Figures are of "
-            "16 episodes of the final policy. With so few seeds, a difference within their spread is none."
-        ),
-        *_part(groups, _OURS, "without", "onedemo without each part"),
-        *_part(groups, _PAPER, "with", "The paper's method with each part"),
-    ]
-    return Document(title=TITLE, blocks=blocks)
+_TURNS = figure("net_turns")
 
 
-def _part(groups: Groups, method: str, sign: str, title: str) -> list[Block]:
+def _part(method: str, sign: str, title: str) -> parts.Section:
     """Bars and a table of one method and its changes."""
-    start = f"{method} {sign} "
-    chosen = {label: group for label, group in groups.items() if label == method or label.startswith(start)}
-    whole = spread(chosen[method], figure("net_turns"))
-    turns = {label: spread(group, figure("net_turns")) for label, group in chosen.items()}
-    rows: list[tuple[Cell, ...]] = []
-    for label, group in chosen.items():
-        change = turns[label].mean - whole.mean
-        rows.append(
-            (
-                label.removeprefix(f"{method} "),
-                str(turns[label]),
-                "" if label == method else f"{'+' if change > 0 else ''}{number(change)}",
-                turns[label].each,
-                *(str(spread(group, figure(name))) for name in _MORE.values()),
-                str(spread(group, lambda result: result["demo_rated"])),
-                str(spread(group, lambda result: result["demo_shuffled"])),
-            )
-        )
-    heads = ("", "net turns", "change", "each seed", *_MORE, "demo's own states", "shuffled")
-    there = {label: figures for label, figures in turns.items() if figures.missing < len(figures.values)}
-    bars = Bars(
-        name=f"ablation_{method}", title=f"{title}: net turns", x_label="turns, mean of 16 episodes",
-        labels=[label.removeprefix(f"{method} ") for label in turns],
-        values=[figures.mean if label in there else None for label, figures in turns.items()],
-        each=[[value for value in figures.values if value is not None] for figures in turns.values()],
-        reference=Reference(label=method, y=whole.mean) if method in there else None, strong=(method,),
-        note="Bar: mean over seeds; dots: each.",
+
+    def of(groups: Groups) -> Groups:
+        start = f"{method} "
+        return {
+            label.removeprefix(start): group
+            for label, group in groups.items()
+            if label == method or label.startswith(f"{start}{sign} ")
+        }
+
+    def change(pick: Pick, group: Sequence[Outcome], groups: Groups) -> str:
+        less = spread(group, pick).mean - spread(groups[method], pick).mean
+        return "" if group is groups[method] else f"{'+' if less > 0 else ''}{number(less)}"
+
+    bars = parts.BarChart(
+        pick=_TURNS, name=f"ablation_{method}", title=f"{title}: net turns", strong=(method,),
+        x_label="turns, mean of 16 episodes", note="Bar: mean over seeds; dots: each.",
+        reference=lambda groups: Reference(label=method, y=spread(groups[method], _TURNS).mean),
     )  # fmt: skip
-    return [Heading(title), *([bars] if there else []), Table(heads=heads, rows=rows)]
+    figures = {
+        "net turns": _TURNS,
+        "change": (_TURNS, change),
+        "each seed": (_TURNS, parts.each),
+        **columns("clean turns", "backflip reward", "similarity, aligned", "demo's own states", "shuffled"),
+    }
+    return parts.Section(title, [bars, parts.Figures(figures)], of)
 
 
-_MORE = {
-    "clean turns": "clean_turns",
-    "backflip reward": "backflip_reward",
-    "similarity, aligned": "aligned_similarity",
-}
+def _facts(groups: Groups) -> dict[str, Any]:
+    seeds = len(groups[_OURS])
+    many = f"{seeds} {'seed' if seeds == 1 else 'seeds'}"
+    return {**parts.settings(groups), "seeds": many, "others": backflip.STEPS}
+
+
+TABLE = parts.Experiment(
+    title="onedemo: what each part contributes", seeds=3, plan=plan,
+    parts=[
+        parts.Worded(
+            "The tumbling demo of 8 s, {ratings} ratings of a rater without error. **{seeds} and {steps:,} "
+            "control steps of practice**: fewer than in the table of methods (5 seeds, {others:,} steps). "
+            "Figures are of 16 episodes of the final policy. With so few seeds, a difference within their "
+            "spread is none.",
+            _facts,
+        ),
+        _part(_OURS, "without", "onedemo without each part"),
+        _part(_PAPER, "with", "The paper's method with each part"),
+    ],
+)  # fmt: skip

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from onedemo.experiments.jobs.method import method_job, whole_config
-from onedemo.experiments.report.blocks import Block, Document, Heading, Text
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.tables.summary import (
-    Goal,
-    Groups,
-    Result,
-    curves,
-    each_seed,
-    error_chart,
-    figure,
-    goals_table,
-    minutes,
-    moving_pictures,
-    table,
-)
+from onedemo.experiments.report.blocks import Heading, Text
+from onedemo.experiments.runner import Job
+from onedemo.experiments.tables import parts
+from onedemo.experiments.tables.episode import BESIDE, Episode
+from onedemo.experiments.tables.parts import Goal, columns, figure, minutes, only, reach
 
-TITLE = "onedemo: the backflip"
-SEEDS = 5
 STEPS = 1_500_000
 """Control steps of every training from ratings, and of those on the true rating."""
 BASELINE_STEPS = 3_000_000
@@ -38,7 +24,6 @@ _PAPER, _OURS = "paper", "onedemo"
 _TRUTH_FIXED, _TRUTH_ELASTIC = "true rating, fixed clock", "true rating, onedemo's practice"
 _FEW, _ON_CLEAN = "onedemo, 100 ratings", "onedemo, clean flips"
 _ERRS, _BLIND = "onedemo, mistakes and jitter", "onedemo, no appearance"
-_PICTURES = {_OURS: "backflip.webp", _ON_CLEAN: "flip_clean.webp", _PAPER: "paper.webp"}
 _METHODS = (_OURS, _PAPER, _TRUTH_ELASTIC, _TRUTH_FIXED, _HAND, _PREFERENCES)
 _VARIANTS = (_OURS, _FEW, _ON_CLEAN, _ERRS, _BLIND)
 
@@ -81,68 +66,10 @@ def _control(kind: str, label: str, seed: int, **settings: str | int) -> Job:
     return Job(kind=kind, label=label, settings=settings, seed=seed)
 
 
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """Goals, figures, curves, error over time, moving pictures."""
-    groups = by_label(outcomes)
-    figures = table(_FIGURES, groups, "Mean of 16 episodes; mean ± deviation over seeds")
-    goals = goals_table(GOALS, groups)
-    blocks: list[Block] = [
-        Text(
-            _INTRODUCTION.format(
-                ratings=groups[_OURS][0].job.settings["ratings"],
-                steps=groups[_OURS][0].job.settings["steps"],
-                baseline=groups[_HAND][0].job.settings["steps"],
-            )
-        ),
-        Heading("What should be reached"),
-        Text(
-            "Over 16 deterministic episodes of the **final** policy, their mean unless it says best. A goal "
-            "is met if so many seeds reach it, and open as long as seeds are missing that could decide it."
-        ),
-        goals,
-        Heading("What is learned"),
-        figures,
-        table(_BEST, groups, "Best of 16 episodes"),
-        each_seed(_EACH, groups, "Each seed, mean of 16 episodes"),
-        table(_MORE, groups, "What it took, and other measures"),
-        Text(_EXPLANATIONS),
-        Heading("How it is learned"),
-        *curves(
-            _only(groups, _METHODS), "net_turns", name="turns", title="Net backward turns", y_label="turns"
-        ),
-        *curves(
-            _only(groups, _METHODS), "backflip_reward", name="reward", title="Backflip reward",
-            y_label="hand-coded reward of an episode",
-        ),
-        *curves(
-            _only(groups, _VARIANTS), "net_turns", name="turns_variants", title="Net backward turns, onedemo",
-            y_label="turns",
-        ),
-        *error_chart(_only(groups, (_OURS, _PAPER))),
-        Heading("What it looks like"),
-        *moving_pictures(groups, _PICTURES),
-    ]  # fmt: skip
-    data = {"goals": [dict(zip(goals.heads, row, strict=True)) for row in goals.rows]}
-    return Document(title=TITLE, blocks=blocks, data=data)
-
-
-def _only(groups: Groups, labels: Sequence[str]) -> Groups:
-    return {label: groups[label] for label in labels if label in groups}
-
-
-def _best_reward_and_turns(result: Result) -> bool:
+def _best_reward_and_turns(result: parts.Result) -> bool:
     figures = result["figures"]
     lane = int(np.argmax(figures["backflip_reward"]["each"]))
     return figures["backflip_reward"]["best"] >= 15_000 and figures["net_turns"]["each"][lane] >= 2
-
-
-def _turns(least: float, reward: float = -np.inf) -> dict:
-    turns, rewarded = figure("net_turns"), figure("backflip_reward")
-
-    def met(result: Result) -> bool:
-        return (turns(result) or 0) >= least and (rewarded(result) or 0) >= reward
-
-    return {"met": met, "shown": turns}
 
 
 GOALS = (
@@ -150,53 +77,18 @@ GOALS = (
         label=_HAND, what="best episode: 15,000 reward and 2 net turns (shown: its reward)",
         met=_best_reward_and_turns, shown=figure("backflip_reward", "best"), of_5=5,
     ),
-    Goal(label=_OURS, what="4 net turns and 5,000 reward", **_turns(4, 5000), of_5=5),
-    Goal(label=_FEW, what="2 net turns and 3,365 reward", **_turns(2, 3365), of_5=4),
-    Goal(label=_ON_CLEAN, what="2 net turns", **_turns(2), of_5=4),
-    Goal(
-        label=_ON_CLEAN, what="1 clean airborne turn", shown=figure("clean_turns"), of_5=3,
-        met=lambda result: (figure("clean_turns")(result) or 0) >= 1,
-    ),
-    Goal(label=_ERRS, what="2 net turns", **_turns(2), of_5=4),
-    Goal(label=_BLIND, what="2 net turns", **_turns(2), of_5=3),
+    reach(_OURS, "4 net turns and 5,000 reward", net_turns=4, backflip_reward=5000, of_5=5),
+    reach(_FEW, "2 net turns and 3,365 reward", net_turns=2, backflip_reward=3365, of_5=4),
+    reach(_ON_CLEAN, "2 net turns", net_turns=2, of_5=4),
+    reach(_ON_CLEAN, "1 clean airborne turn", clean_turns=1, of_5=3),
+    reach(_ERRS, "2 net turns", net_turns=2, of_5=4),
+    reach(_BLIND, "2 net turns", net_turns=2, of_5=3),
     Goal(
         label=_OURS, what="under 10 minutes on one core, evaluation not counted (shown: minutes)",
         met=lambda result: minutes(result) < 10, shown=minutes, of_5=5,
     ),
 )  # fmt: skip
 """The project's, set before any of these runs."""
-
-_FIGURES = {
-    "net turns": figure("net_turns"),
-    "clean turns": figure("clean_turns"),
-    "landed": figure("landings"),
-    "backflip reward": figure("backflip_reward"),
-    "with raw actions": figure("backflip_reward_raw_actions"),
-    "similarity, aligned": figure("aligned_similarity"),
-}
-_BEST = {
-    "net turns": figure("net_turns", "best"),
-    "clean turns": figure("clean_turns", "best"),
-    "landed": figure("landings", "best"),
-    "backflip reward": figure("backflip_reward", "best"),
-    "with raw actions": figure("backflip_reward_raw_actions", "best"),
-    "similarity, aligned": figure("aligned_similarity", "best"),
-}
-_EACH = {
-    "net turns": figure("net_turns"),
-    "clean turns": figure("clean_turns"),
-    "backflip reward": figure("backflip_reward"),
-}
-_MORE = {
-    "ratings": lambda result: result["ratings"],
-    "control steps": lambda result: result["env_steps"],
-    "minutes": minutes,
-    "similarity, real time": figure("true_similarity"),
-    "predicted": figure("predicted_similarity"),
-    "state error": figure("state_error"),
-    "demo's own states": lambda result: result.get("demo_rated"),
-    "shuffled": lambda result: result.get("demo_shuffled"),
-}
 
 _INTRODUCTION = (
     "One demo, 8 s, and a simulated rater without error: {ratings} ratings, four of seven before practice, "
@@ -219,3 +111,43 @@ _EXPLANATIONS = (
     "hidden states beside its own frames, in order and in random order. **Minutes**: on one core, without "
     "evaluation, which those of the baselines include."
 )
+_FIGURES = (
+    "net turns", "clean turns", "landed", "backflip reward", "with raw actions", "similarity, aligned",
+)  # fmt: skip
+_EACH = columns("net turns", "clean turns", "backflip reward")
+_MORE = columns(
+    "ratings", "control steps", "minutes", "similarity, real time", "predicted", "state error",
+    "demo's own states", "shuffled",
+)  # fmt: skip
+_TURNS, _REWARD = "Net backward turns", "hand-coded reward of an episode"
+
+TABLE = parts.Experiment(
+    title="onedemo: the backflip", seeds=5, plan=plan,
+    parts=[
+        parts.Worded(
+            _INTRODUCTION,
+            lambda groups: {**parts.settings(groups), "baseline": groups[_HAND][0].job.settings["steps"]},
+        ),
+        Heading("What should be reached"),
+        Text(
+            "Over 16 deterministic episodes of the **final** policy, their mean unless it says best. A goal "
+            "is met if so many seeds reach it, and open as long as seeds are missing that could decide it."
+        ),
+        parts.Goals(GOALS),
+        Heading("What is learned"),
+        parts.Figures(columns(*_FIGURES), parts.OVER_SEEDS),
+        parts.Figures(columns(*_FIGURES, part="best"), "Best of 16 episodes"),
+        parts.Figures(_EACH, "Each seed, mean of 16 episodes", parts.each),
+        parts.Figures(_MORE, "What it took, and other measures"),
+        Text(_EXPLANATIONS),
+        Heading("How it is learned"),
+        parts.Curves("net_turns", "turns", _TURNS, "turns", only(*_METHODS)),
+        parts.Curves("backflip_reward", "reward", "Backflip reward", _REWARD, only(*_METHODS)),
+        parts.Curves("net_turns", "turns_variants", f"{_TURNS}, onedemo", "turns", only(*_VARIANTS)),
+        parts.Section("", [parts.error_chart], only(_OURS, _PAPER)),
+        Heading("What it looks like"),
+        Episode(_OURS, "backflip.webp", BESIDE),
+        Episode(_ON_CLEAN, "flip_clean.webp", BESIDE),
+        Episode(_PAPER, "paper.webp", BESIDE),
+    ],
+)  # fmt: skip

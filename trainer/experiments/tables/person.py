@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-import numpy as np
-
 from onedemo.errors import UserError
-from onedemo.experiments.jobs.person import person_demo, person_job, video
-from onedemo.experiments.report.blocks import Block, Document, Heading, Picture, Text, number
-from onedemo.experiments.report.movie import movie
-from onedemo.experiments.report.strip import strip
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.tables.summary import (
-    Goal,
-    Groups,
-    curves,
-    each_seed,
-    figure,
-    goals_table,
-    median_outcome,
-    minutes,
-    table,
-)
+from onedemo.experiments.jobs.person import person_job, video
+from onedemo.experiments.report.blocks import Heading, Text
+from onedemo.experiments.runner import Job
+from onedemo.experiments.tables import parts
+from onedemo.experiments.tables.episode import Episode
+from onedemo.experiments.tables.parts import columns, reach
 
-TITLE = "onedemo: a real person's backflip"
-SEEDS = 5
 STEPS = 1_000_000
 RATINGS = 350
 QUICK_STEPS, QUICK_RATINGS = 32_000, 30
@@ -58,30 +42,7 @@ def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
     return jobs
 
 
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """Goals, what the agent does, strips of frames, moving pictures; or why there is nothing."""
-    groups = by_label(outcomes)
-    if not outcomes:
-        return Document(title=TITLE, blocks=[Text(f"**Skipped**: {_reason()}.")], data={"skipped": _reason()})
-    goals = goals_table(GOALS, groups)
-    blocks: list[Block] = [
-        Text(_INTRODUCTION),
-        Heading("What should be reached"),
-        goals,
-        Heading("What the agent does"),
-        table(_FIGURES, groups, "Mean of 16 episodes; mean ± deviation over seeds"),
-        table(_BEST, groups, "Best of 16 episodes"),
-        each_seed(_EACH, groups, "Each seed"),
-        Text(_EXPLANATIONS),
-        *curves(groups, "net_turns", name="person_turns", title="Net backward turns", y_label="turns"),
-        Heading("What it looks like"),
-        *_pictures(groups),
-    ]
-    data = {"goals": [dict(zip(goals.heads, row, strict=True)) for row in goals.rows]}
-    return Document(title=TITLE, blocks=blocks, data=data)
-
-
-def _reason() -> str:
+def _skipped() -> str:
     try:
         video()
     except UserError as error:
@@ -89,65 +50,12 @@ def _reason() -> str:
     return "no seed was asked for"
 
 
-def _pictures(groups: Groups) -> list[Block]:
-    """The best episode of each method's median seed, as a strip; of onedemo's, moving."""
-    blocks: list[Block] = []
-    with tempfile.TemporaryDirectory() as directory:
-        for label, group in groups.items():
-            median = median_outcome(group, figure("turned"))
-            if median is None or median.result is None:
-                continue
-            shown = median.result["episode"]
-            qpos = np.array(shown["qpos"])
-            turned = median.result["figures"]["turned"]["each"][shown["which"]]
-            text = f"{label}, seed {median.job.seed}, {number(turned)} turns backward"
-            note = (
-                f"{text}; the median seed, its best episode. Above the person, below the robot, same times."
-            )
-            try:
-                demo = person_demo(Path(directory))
-                pictures = [(f"person_{label}_strip.webp", strip(demo, qpos), note)]
-                if label == _OURS:
-                    pictures.append((f"person_{label}.webp", movie(demo, qpos), f"{text}; the same episode."))
-            except UserError as error:
-                blocks.append(Text(f"No pictures: {error}."))
-                break
-            blocks += [Picture(name=n, data=data, alt=text, note=below) for n, data, below in pictures]
-    return blocks
-
-
 GOALS = (
-    Goal(
-        label=_OURS, what="1 net backward turn", shown=figure("net_turns"), of_5=2,
-        met=lambda result: (figure("net_turns")(result) or 0) >= 1,
-    ),
-    Goal(
-        label=_OURS, what="beyond: 1 clean backward turn", shown=figure("clean_turns"), of_5=2,
-        met=lambda result: (figure("clean_turns")(result) or 0) >= 1,
-    ),
-)  # fmt: skip
+    reach(_OURS, "1 net backward turn", net_turns=1, of_5=2),
+    reach(_OURS, "beyond: 1 clean backward turn", clean_turns=1, of_5=2),
+)
 """The project's, set before any of these runs. Means of 16 episodes."""
 
-_FIGURES = {
-    "net turns": figure("net_turns"),
-    "clean turns": figure("clean_turns"),
-    "landed": figure("landings"),
-    "turned": figure("turned"),
-    "farthest turn": figure("farthest_turn"),
-    "predicted": figure("predicted_similarity"),
-    "ratings": lambda result: result["ratings"],
-    "minutes": minutes,
-}
-_BEST = {name: figure(key, "best") for name, key in (
-    ("net turns", "net_turns"), ("clean turns", "clean_turns"), ("landed", "landings"), ("turned", "turned"),
-    ("farthest turn", "farthest_turn"),
-)}  # fmt: skip
-_EACH = {
-    "net turns": figure("net_turns"),
-    "clean turns": figure("clean_turns"),
-    "turned": figure("turned"),
-    "farthest turn": figure("farthest_turn"),
-}
 _INTRODUCTION = (
     "A real person's backflip off a box, 2.2 s, is shown to a robot with one leg and no arms. The simulated "
     "rater compares what a person would see: how far the torso is turned, how fast it turns, and whether "
@@ -164,3 +72,30 @@ _EXPLANATIONS = (
     "turns with no part but the foot touching the ground. **Landed**: turns after which the robot stands. "
     "**Predicted**: mean rating by the final predictor, by the method's own clock."
 )
+_TURNS = ("net turns", "clean turns", "landed", "turned", "farthest turn")
+_episode = partial(Episode, figure="turned", text="{label}, seed {seed}, {value} turns backward")
+_strip = partial(
+    _episode, part=(0.0, 1.0),
+    note="{text}; the median seed, its best episode. Above the person, below the robot, same times.",
+)  # fmt: skip
+
+TABLE = parts.Experiment(
+    title="onedemo: a real person's backflip", seeds=5, plan=plan, skipped=_skipped,
+    parts=[
+        Text(_INTRODUCTION),
+        Heading("What should be reached"),
+        parts.Goals(GOALS),
+        Heading("What the agent does"),
+        parts.Figures(columns(*_TURNS, "predicted", "ratings", "minutes"), parts.OVER_SEEDS),
+        parts.Figures(columns(*_TURNS, part="best"), "Best of 16 episodes"),
+        parts.Figures(
+            columns("net turns", "clean turns", "turned", "farthest turn"), "Each seed", parts.each
+        ),
+        Text(_EXPLANATIONS),
+        parts.Curves("net_turns", "person_turns", "Net backward turns", "turns"),
+        Heading("What it looks like"),
+        _strip(_OURS, "person_onedemo_strip.webp"),
+        _episode(_OURS, "person_onedemo.webp", note="{text}; the same episode."),
+        _strip(_PAPER, "person_paper_strip.webp"),
+    ],
+)  # fmt: skip

@@ -5,58 +5,28 @@ And what the paper does not show: what such a predictor is worth as a reward.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS
-from onedemo.experiments.jobs.predictor_trial import VARIANTS
-from onedemo.experiments.predictor_scores import BINS, interval
-from onedemo.experiments.report.blocks import (
-    Bars,
-    Block,
-    Bullets,
-    Cell,
-    Chart,
-    Document,
-    Heading,
-    Line,
-    Reference,
-    Table,
-    Text,
-)
-from onedemo.experiments.runner import Job, Outcome, by_label
+from onedemo.experiments.predictor_scores import BINS
+from onedemo.experiments.report.blocks import Block, Bullets, Chart, Heading, Line, Reference, Table, Text
+from onedemo.experiments.runner import Job, Outcome
 from onedemo.experiments.statistics import spread
-from onedemo.experiments.tables.predictor_figures import (
-    BESIDES,
-    CONTRAST,
-    COUNTED,
-    F1,
-    F1_HIGH,
-    OURS,
-    OWN,
-    PAPER,
-    PAPERS_CHOICE,
-    PICKED,
-    POLICIES,
-    TEST,
-    WORTH,
-    Figure,
-    findings,
-    rank,
-)
+from onedemo.experiments.tables import parts
+from onedemo.experiments.tables import predictor_figures as figures
+from onedemo.experiments.tables.parts import BarChart, Figures, Groups, Part, Section
+from onedemo.experiments.tables.predictor_figures import COUNTED, OURS, PAPERS_CHOICE, POLICIES, named
 from onedemo.reward.model import CLASSES
-
-TITLE = "onedemo: how well ratings are predicted (Table 1)"
-SEEDS = 5
 
 _SKEWED, _ASKED = "random policy", "asked by onedemo"
 _DATA = {_SKEWED: "paper", _ASKED: "onedemo"}
 _PARTS = ("fitted", "validation", "test")
 _COMPARED = {
-    "Accuracy": (TEST, F1, F1_HIGH),
-    "Worth": (CONTRAST, PICKED, rank(OTHERS), rank(ATTEMPTS)),
+    "Accuracy": figures.ACCURACY,
+    "Worth": named("own less shuffled", "picked states", OTHERS, ATTEMPTS),
 }
 _ENOUGH = 10
 """Clips in a bin of the reliability chart."""
@@ -72,33 +42,6 @@ def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
         for seed in seeds
         for label, data in _DATA.items()
     ]
-
-
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """Both kinds of ratings, then what the predictors are worth as a reward."""
-    groups = by_label(outcomes)
-    there = {label: group for label, group in groups.items() if any(o.result for o in group)}
-    blocks: list[Block] = [Text(_INTRODUCTION), Heading("In short")]
-    blocks += [Bullets([sentence for label, group in there.items() for sentence in findings(label, group)])]
-    for label, group in there.items():
-        blocks += [Heading(f"Ratings: {label}"), *_accuracy(label, group)]
-    blocks += [Heading("What it is worth as a reward"), Text(_WORTH_TEXT)]
-    for label, group in there.items():
-        blocks += _worth(label, group)
-    blocks += [Heading("Differences, seed by seed"), Text(_DIFFERENCES_TEXT)]
-    blocks += [
-        _differences(label, group, what, figures)
-        for label, group in there.items()
-        for what, figures in _COMPARED.items()
-    ]
-    blocks += [Heading("What is taken for what"), Text(_CONFUSION_TEXT)]
-    blocks += [
-        _confusion(label, group, name) for label, group in there.items() for name in (PAPERS_CHOICE, OURS)
-    ]
-    blocks += [Heading("Whether its chances are right"), Text(_RELIABILITY_TEXT)]
-    blocks += [_reliability(label, group) for label, group in there.items()]
-    blocks += [Heading("Definitions"), Bullets(_DEFINITIONS)]
-    return Document(title=TITLE, blocks=blocks, data={"figures": _figures(groups)})
 
 
 _INTRODUCTION = (
@@ -156,159 +99,183 @@ _DEFINITIONS = (
 )
 
 
-def _accuracy(label: str, outcomes: Sequence[Outcome]) -> list[Block]:
-    always = [spread(outcomes, lambda r, part=part: _always_the_same(r, part)) for part in _PARTS[1:]]
-    last: list[Cell] = ["always the same", *map(str, always), *[None] * (len(COUNTED) - len(always))]
-    blocks: list[Block] = [
-        Text(_ABOUT[label]),
-        Table(
-            title="Ratings of each class",
-            heads=("", *map(str, range(1, CLASSES + 1))),
-            rows=[[part, *(_class_count(outcomes, part, k) for k in range(CLASSES))] for part in _PARTS],
-        ),
-        _table("Clips not fitted, %", outcomes, COUNTED, last),
-    ]
-    if label == _SKEWED:
-        blocks.append(
-            Table(
-                title="In the paper, %: ratings by people, means of 2 runs",
-                heads=("predictor", *(figure.head for figure in COUNTED[:4])),
-                rows=[[name, *figures] for name, figures in PAPER.items()],
-                notes=["With the additional layer 4.56 % of its clips were off by 3, 3.56 % by 4."],
-            )
-        )
-    level = Reference(label="always the same", y=always[1].mean)
-    return [
-        *blocks,
-        _bars(label, outcomes, TEST, f"Test accuracy; ratings: {label}", "%", level),
-        _bars(label, outcomes, F1, f"F1 of ratings 3 to 5; ratings: {label}", "%, clips not fitted"),
-        _table("The other reading of F1, %; chances; cost", outcomes, BESIDES),
-        _each(outcomes, (TEST, F1, F1_HIGH)),
-    ]
+def _variants(label: str) -> Callable[[Groups], Groups]:
+    """A group for each predictor of one kind of ratings; none if there are no results."""
+
+    def of(groups: Groups) -> Groups:
+        group = groups.get(label, ())
+        return figures.by_variant(group) if any(o.result for o in group) else {}
+
+    return of
 
 
-def _class_count(outcomes: Sequence[Outcome], part: str, k: int) -> str:
-    return str(spread(outcomes, lambda result: result["classes"][part][k]))
+def _findings(groups: Groups) -> Iterable[Block]:
+    there = {label: _variants(label)(groups) for label in _DATA}
+    yield Bullets([s for label, found in there.items() if found for s in figures.findings(label, found)])
 
 
-def _always_the_same(result: Mapping[str, Any], part: str) -> float:
-    counts = result["classes"][part]
-    return 100 * counts[int(np.argmax(result["classes"]["fitted"]))] / sum(counts)
+def _table(title: str, which: Mapping[str, parts.Pick], show: parts.Show = parts.mean, **more: Any) -> Part:
+    return Figures(which, title, show, head="predictor", **more)
 
 
-def _worth(label: str, outcomes: Sequence[Outcome]) -> list[Block]:
-    truth = {p: spread(outcomes, lambda r, p=p: r["truth"]["clips"][p]) for p in POLICIES}
-    shuffled = spread(outcomes, lambda result: result["truth"]["shuffled"])
-    oracle: list[Cell] = ["the truth", "5", str(shuffled), None]
-    clips = ", ".join(f"{policy} {mean}" for policy, mean in truth.items())
-    right = Reference(label="right", y=5.0)
-    return [
-        _table(f"Rating of states; ratings fitted: {label}", outcomes, WORTH[:3], oracle),
-        _table(
-            f"Rank correlation on clips of other policies; ratings fitted: {label}",
-            outcomes,
-            WORTH[3:],
-            notes=[f"Mean true rating of these clips: {clips}."],
-        ),
-        _bars(label, outcomes, OWN, f"The demo's own states; fitted: {label}", "predicted rating", right),
-        _bars(label, outcomes, rank(OTHERS), f"Rank correlation, other moves; fitted: {label}", "Spearman"),
-        _each(outcomes, WORTH[:3]),
-        _each(outcomes, WORTH[3:]),
-    ]  # fmt: skip
-
-
-def _table(
-    title: str, outcomes: Sequence[Outcome], figures: Sequence[Figure], last: Sequence[Cell] = (),
-    notes: Sequence[str] = (),
-) -> Table:  # fmt: skip
-    """Mean and deviation of figures of all predictors, and a last row."""
-    rows: list[Sequence[Cell]] = [[name, *(str(f.of(outcomes, name)) for f in figures)] for name in VARIANTS]
-    heads = ("predictor", *(figure.head for figure in figures))
-    return Table(title=title, heads=heads, rows=[*rows, *([last] if last else [])], notes=notes)
-
-
-def _each(outcomes: Sequence[Outcome], figures: Sequence[Figure]) -> Table:
-    seeds = ", ".join(str(outcome.job.seed) for outcome in outcomes)
-    return Table(
-        title=f"Each seed, in the order {seeds}",
-        heads=("predictor", *(figure.head for figure in figures)),
-        rows=[[name, *(f.of(outcomes, name).each for f in figures)] for name in VARIANTS],
-    )
+def _each(which: Mapping[str, parts.Pick]) -> Part:
+    return _table("Each seed, in the order {seeds}", which, parts.each)
 
 
 def _bars(
-    label: str, outcomes: Sequence[Outcome], figure: Figure, title: str, x_label: str,
-    reference: Reference | None = None,
-) -> Bars:  # fmt: skip
-    spreads = [figure.of(outcomes, name) for name in VARIANTS]
-    return Bars(
-        name=f"{figure.head} {label}".lower().replace(" ", "-"),
-        title=title,
-        x_label=x_label,
-        labels=list(VARIANTS),
-        values=[s.mean if np.isfinite(s.mean) else None for s in spreads],
-        each=[[value for value in s.values if value is not None] for s in spreads],
-        reference=reference,
-        strong=[PAPERS_CHOICE, OURS],
+    label: str, head: str, title: str, x_label: str, reference: Callable[[Groups], Reference] | None = None
+) -> Part:
+    return BarChart(
+        pick=figures.FIGURES[head], name=f"{head} {label}".lower().replace(" ", "-"), title=title,
+        x_label=x_label, strong=[PAPERS_CHOICE, OURS], reference=reference,
         note="Dots: seeds. Strong bars: the paper's choice and onedemo's.",
-    )
-
-
-def _differences(label: str, outcomes: Sequence[Outcome], what: str, figures: Sequence[Figure]) -> Table:
-    def cell(figure: Figure, name: str) -> str:
-        values = figure.paired(outcomes, name)
-        if len(values) < 2:
-            return "–"
-        if not np.any(values):
-            return "the same"
-        low, high = interval(values)
-        text = f"{np.mean(values):+.2g} [{low:.2g}, {high:.2g}]"
-        return f"**{text}**" if figure.differs(outcomes, name) else text
-
-    return Table(
-        title=f"{what}, less {PAPERS_CHOICE}; ratings: {label}",
-        heads=("predictor", *(figure.head for figure in figures)),
-        rows=[[name, *(cell(f, name) for f in figures)] for name in VARIANTS if name != PAPERS_CHOICE],
-    )
-
-
-def _confusion(label: str, outcomes: Sequence[Outcome], name: str) -> Table:
-    counts = _pooled(outcomes, name, "confusion")
-    return Table(
-        title=f"{name}; ratings: {label}",
-        heads=("given", *(f"predicted {k}" for k in range(1, CLASSES + 1))),
-        rows=[[str(k), *map(str, row)] for k, row in enumerate(counts.tolist(), start=1)],
-    )
-
-
-def _reliability(label: str, outcomes: Sequence[Outcome]) -> Chart:
-    lines = [Line(label="as it should be", x=[0, 100], y=[0, 100], colour="#8a94a3", dashed=True)]
-    for name in (PAPERS_CHOICE, "ordinal, 3 networks", OURS):
-        clips, chances, happened = _pooled(outcomes, name, "reliability")
-        enough = clips >= _ENOUGH
-        clips, chances, happened = clips[enough], chances[enough], happened[enough]
-        lines.append(Line(label=name, x=100 * chances / clips, y=100 * happened / clips, marks=True))
-    return Chart(
-        name=f"reliability-{label}".replace(" ", "-"), title=f"Rated 3 or more; ratings: {label}",
-        x_label="predicted chance, %", y_label="share of clips, %", lines=lines, wide=False,
     )  # fmt: skip
 
 
-def _pooled(outcomes: Sequence[Outcome], name: str, key: str) -> np.ndarray:
-    return np.sum([o.result["variants"][name][key] for o in outcomes if o.result], axis=0)
+_COUNTS = {str(k + 1): lambda result, k=k: result["classes"][k] for k in range(CLASSES)}
+_IN_THE_PAPER = Table(
+    title="In the paper, %: ratings by people, means of 2 runs",
+    heads=("predictor", *list(COUNTED)[:4]),
+    rows=[[name, *each] for name, each in figures.PAPER.items()],
+    notes=["With the additional layer 4.56 % of its clips were off by 3, 3.56 % by 4."],
+)
 
 
-def _figures(groups: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
+def _classes(groups: Groups) -> Groups:
+    return figures.split(groups[OURS], "classes", _PARTS)
+
+
+def _always(groups: Groups) -> list[Any]:
+    scores = [str(figures.always_the_same(groups[OURS], part)) for part in _PARTS[1:]]
+    return ["always the same", *scores, *[None] * (len(COUNTED) - len(scores))]
+
+
+def _level(groups: Groups) -> Reference:
+    return Reference(label="always the same", y=figures.always_the_same(groups[OURS], "test").mean)
+
+
+def _accuracy(label: str) -> list[Part]:
+    return [
+        Text(_ABOUT[label]),
+        Section("", [Figures(_COUNTS, "Ratings of each class")], _classes),
+        _table("Clips not fitted, %", COUNTED, last=_always),
+        *([_IN_THE_PAPER] if label == _SKEWED else []),
+        _bars(label, "test", f"Test accuracy; ratings: {label}", "%", _level),
+        _bars(label, "F1 of 3-5", f"F1 of ratings 3 to 5; ratings: {label}", "%, clips not fitted"),
+        _table("The other reading of F1, %; chances; cost", figures.BESIDES),
+        _each(figures.ACCURACY),
+    ]
+
+
+def _truth(groups: Groups) -> list[Any]:
+    return ["the truth", "5", str(spread(groups[OURS], lambda result: result["truth"]["shuffled"])), None]
+
+
+def _true_ratings(groups: Groups) -> list[str]:
+    of = {p: spread(groups[OURS], lambda result, p=p: result["truth"]["clips"][p]) for p in POLICIES}
+    return [f"Mean true rating of these clips: {', '.join(f'{policy} {x}' for policy, x in of.items())}."]
+
+
+def _right(groups: Groups) -> Reference:
+    return Reference(label="right", y=5.0)
+
+
+def _worth(label: str) -> list[Part]:
+    ranks = f"Rank correlation on clips of other policies; ratings fitted: {label}"
+    return [
+        _table(f"Rating of states; ratings fitted: {label}", figures.RATED, last=_truth),
+        _table(ranks, figures.RANKS, notes=_true_ratings),
+        _bars(label, "own states", f"The demo's own states; fitted: {label}", "predicted rating", _right),
+        _bars(label, OTHERS, f"Rank correlation, other moves; fitted: {label}", "Spearman"),
+        _each(figures.RATED),
+        _each(figures.RANKS),
+    ]
+
+
+def _differences(label: str) -> list[Part]:
+    return [
+        _table(
+            f"{what}, less {PAPERS_CHOICE}; ratings: {label}", which, figures.difference,
+            without=PAPERS_CHOICE,
+        )
+        for what, which in _COMPARED.items()
+    ]  # fmt: skip
+
+
+def _pooled(groups: Groups, name: str, key: str) -> np.ndarray:
+    """All seeds together."""
+    return np.sum([o.result["variants"][key] for o in groups[name] if o.result], axis=0)
+
+
+def _confusion(label: str) -> list[Part]:
+    def tables(groups: Groups) -> Iterable[Block]:
+        for name in (PAPERS_CHOICE, OURS):
+            counts = _pooled(groups, name, "confusion").tolist()
+            yield Table(
+                title=f"{name}; ratings: {label}",
+                heads=("given", *(f"predicted {k}" for k in range(1, CLASSES + 1))),
+                rows=[[str(k), *map(str, row)] for k, row in enumerate(counts, start=1)],
+            )
+
+    return [tables]
+
+
+def _reliability(label: str) -> list[Part]:
+    def chart(groups: Groups) -> Iterable[Block]:
+        lines = [Line(label="as it should be", x=[0, 100], y=[0, 100], colour="#8a94a3", dashed=True)]
+        for name in (PAPERS_CHOICE, "ordinal, 3 networks", OURS):
+            bins = _pooled(groups, name, "reliability")
+            clips, chances, happened = bins[:, bins[0] >= _ENOUGH]
+            lines.append(Line(label=name, x=100 * chances / clips, y=100 * happened / clips, marks=True))
+        yield Chart(
+            name=f"reliability-{label}".replace(" ", "-"), title=f"Rated 3 or more; ratings: {label}",
+            x_label="predicted chance, %", y_label="share of clips, %", lines=lines, wide=False,
+        )  # fmt: skip
+
+    return [chart]
+
+
+def _of_both(made: Callable[[str], list[Part]], heading: str = "") -> list[Part]:
+    """Parts about the predictors that were fitted on each kind of ratings."""
+    return [Section(heading.format(label), made(label), _variants(label)) for label in _DATA]
+
+
+def _data(groups: Groups) -> dict[str, Any]:
     """Everything by ratings, predictor and figure."""
+    recorded = {head: pick for head, pick in figures.FIGURES.items() if head not in figures.CONTRAST}
+
+    def record(group: Sequence[Outcome]) -> dict[str, Any]:
+        over = {head: spread(group, pick) for head, pick in recorded.items()}
+        return {h: {"mean": s.mean, "deviation": s.deviation, "each": s.values} for h, s in over.items()}
+
     return {
-        label: {name: {f.head: _record(f, group, name) for f in _RECORDED} for name in VARIANTS}
-        for label, group in groups.items()
+        "figures": {
+            label: {name: record(each) for name, each in figures.by_variant(group).items()}
+            for label, group in groups.items()
+        }
     }
 
 
-_RECORDED = (*COUNTED, *BESIDES, *WORTH)
-
-
-def _record(figure: Figure, outcomes: Sequence[Outcome], name: str) -> dict[str, Any]:
-    over = figure.of(outcomes, name)
-    return {"mean": over.mean, "deviation": over.deviation, "each": over.values}
+TABLE = parts.Experiment(
+    title="onedemo: how well ratings are predicted (Table 1)", seeds=5, plan=plan, data=_data,
+    parts=[
+        Text(_INTRODUCTION),
+        Heading("In short"),
+        _findings,
+        *_of_both(_accuracy, "Ratings: {}"),
+        Heading("What it is worth as a reward"),
+        Text(_WORTH_TEXT),
+        *_of_both(_worth),
+        Heading("Differences, seed by seed"),
+        Text(_DIFFERENCES_TEXT),
+        *_of_both(_differences),
+        Heading("What is taken for what"),
+        Text(_CONFUSION_TEXT),
+        *_of_both(_confusion),
+        Heading("Whether its chances are right"),
+        Text(_RELIABILITY_TEXT),
+        *_of_both(_reliability),
+        Heading("Definitions"),
+        Bullets(_DEFINITIONS),
+    ],
+)  # fmt: skip

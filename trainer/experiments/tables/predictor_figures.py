@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from onedemo.experiments.jobs.predictor_exam import ATTEMPTS, OTHERS, STANDING, WILD
+from onedemo.experiments.jobs.predictor_trial import VARIANTS
 from onedemo.experiments.predictor_scores import interval
 from onedemo.experiments.report.blocks import number
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.statistics import Spread, spread
+from onedemo.experiments.tables.parts import Groups, Pick, Result
 
 PAPER = {
     "random sampling": (54.22, 42.89, 13.46, 6.97),
@@ -23,67 +25,106 @@ PAPER = {
 }
 """Of Gandhi et al., Table 1, %: validation, test, F1 of 3 to 5, F1 of 4 and 5."""
 PAPERS_CHOICE, OURS = "additional layer", "metric"
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """One figure of one predictor."""
-
-    head: str
-    pick: Callable[[Mapping[str, Any]], float | None]
-    """Takes it from the predictor's part of a result."""
-
-    def of(self, outcomes: Sequence[Outcome], variant: str) -> Spread:
-        """Over the seeds."""
-        return spread(outcomes, lambda result: self.pick(result["variants"][variant]))
-
-    def paired(self, outcomes: Sequence[Outcome], variant: str) -> list[float]:
-        """Less that of the paper's choice, on the seeds that have both."""
-        pairs = zip(self.of(outcomes, variant).values, self.of(outcomes, PAPERS_CHOICE).values, strict=True)
-        return [a - b for a, b in pairs if a is not None and b is not None]
-
-    def differs(self, outcomes: Sequence[Outcome], variant: str) -> bool:
-        """Whether zero lies outside the 95 % interval of the difference, seed by seed."""
-        low, high = interval(self.paired(outcomes, variant))
-        return low > 0 or high < 0
-
-
-def _percent(head: str, key: str) -> Figure:
-    return Figure(head, lambda part: None if part[key] is None else 100 * part[key])
-
-
-def rank(policy: str) -> Figure:
-    """Rank correlation on clips of a policy."""
-    return Figure(policy, lambda part: part["ranks"][policy])
-
-
-TEST, F1, F1_HIGH = _percent("test", "test"), _percent("F1 of 3-5", "f1_3"), _percent("F1 of 4-5", "f1_4")
-COUNTED = (
-    _percent("validation", "validation"), TEST, F1, F1_HIGH, _percent("off by 3", "error_3"),
-    _percent("off by 4", "error_4"),
-)  # fmt: skip
-BESIDES = (
-    _percent("mean F1 of 3, 4, 5", "macro_3"), _percent("mean F1 of 4, 5", "macro_4"),
-    _percent("calibration error", "calibration"), Figure("fit, s", lambda part: part["fit_s"]),
-)  # fmt: skip
-OWN = Figure("own states", lambda part: part["own"])
-SHUFFLED = Figure("shuffled", lambda part: part["shuffled"])
-CONTRAST = Figure("own less shuffled", lambda part: part["own"] - part["shuffled"])
-PICKED = Figure("picked states", lambda part: part["picked"])
 POLICIES = (STANDING, WILD, OTHERS, ATTEMPTS)
-WORTH = (OWN, SHUFFLED, PICKED, *map(rank, POLICIES))
 
 
-def findings(label: str, outcomes: Sequence[Outcome]) -> list[str]:
+def split(outcomes: Sequence[Outcome], key: str, names: Iterable[str]) -> Groups:
+    """A group for each name, whose results have what belongs to that name alone under the key."""
+
+    def one(outcome: Outcome, name: str) -> Outcome:
+        result = outcome.result
+        return replace(outcome, kept={"result": {**result, key: result[key][name]}}) if result else outcome
+
+    return {name: [one(outcome, name) for outcome in outcomes] for name in names}
+
+
+def by_variant(outcomes: Sequence[Outcome]) -> Groups:
+    """A group for each predictor."""
+    return split(outcomes, "variants", VARIANTS)
+
+
+def _of(key: str) -> Pick:
+    return lambda result: result["variants"][key]
+
+
+def _percent(key: str) -> Pick:
+    def pick(result: Result) -> float | None:
+        share = result["variants"][key]
+        return None if share is None else 100 * share
+
+    return pick
+
+
+def _rank(policy: str) -> Pick:
+    return lambda result: result["variants"]["ranks"][policy]
+
+
+COUNTED = {
+    "validation": _percent("validation"), "test": _percent("test"), "F1 of 3-5": _percent("f1_3"),
+    "F1 of 4-5": _percent("f1_4"), "off by 3": _percent("error_3"), "off by 4": _percent("error_4"),
+}  # fmt: skip
+BESIDES = {
+    "mean F1 of 3, 4, 5": _percent("macro_3"), "mean F1 of 4, 5": _percent("macro_4"),
+    "calibration error": _percent("calibration"), "fit, s": _of("fit_s"),
+}  # fmt: skip
+RATED = {"own states": _of("own"), "shuffled": _of("shuffled"), "picked states": _of("picked")}
+RANKS = {policy: _rank(policy) for policy in POLICIES}
+CONTRAST = {"own less shuffled": lambda result: result["variants"]["own"] - result["variants"]["shuffled"]}
+FIGURES: Mapping[str, Pick] = {**COUNTED, **BESIDES, **RATED, **RANKS, **CONTRAST}
+
+
+def named(*heads: str) -> dict[str, Pick]:
+    """Figures by their heads."""
+    return {head: FIGURES[head] for head in heads}
+
+
+ACCURACY = named("test", "F1 of 3-5", "F1 of 4-5")
+
+
+def paired(pick: Pick, one: Sequence[Outcome], other: Sequence[Outcome]) -> list[float]:
+    """The figure of one predictor less that of another, on the seeds that have both."""
+    pairs = zip(spread(one, pick).values, spread(other, pick).values, strict=True)
+    return [a - b for a, b in pairs if a is not None and b is not None]
+
+
+def differs(values: Sequence[float]) -> bool:
+    """Whether zero lies outside the 95 % interval of their mean."""
+    low, high = interval(values)
+    return low > 0 or high < 0
+
+
+def difference(pick: Pick, group: Sequence[Outcome], groups: Groups) -> str:
+    """Mean and interval of what a predictor has more than the paper's choice."""
+    values = paired(pick, group, groups[PAPERS_CHOICE])
+    if len(values) < 2:
+        return "–"
+    if not np.any(values):
+        return "the same"
+    low, high = interval(values)
+    text = f"{np.mean(values):+.2g} [{low:.2g}, {high:.2g}]"
+    return f"**{text}**" if differs(values) else text
+
+
+def always_the_same(outcomes: Sequence[Outcome], part: str) -> Spread:
+    """Accuracy, %, of predicting the most frequent of the ratings that were fitted for all clips."""
+
+    def pick(result: Mapping[str, Any]) -> float:
+        counts = result["classes"][part]
+        return 100 * counts[int(np.argmax(result["classes"]["fitted"]))] / sum(counts)
+
+    return spread(outcomes, pick)
+
+
+def findings(label: str, groups: Groups) -> list[str]:
     """The outcome in sentences, the loudest where nothing can be told apart.
 
     Args:
         label: Which ratings.
-        outcomes: Of these, one for each seed.
+        groups: The outcomes of each predictor.
     """
-    sentences = [_apart(f"**{label}, {figure.head}**", figure, outcomes) for figure in (TEST, F1, F1_HIGH)]
+    sentences = [_apart(f"**{label}, {head}**", pick, groups) for head, pick in ACCURACY.items()]
     paper, ours = (
-        [figure.of(outcomes, name) for figure in (OWN, SHUFFLED, PICKED, rank(OTHERS))]
+        [spread(groups[name], pick) for pick in (*RATED.values(), RANKS[OTHERS])]
         for name in (PAPERS_CHOICE, OURS)
     )
     return [
@@ -95,9 +136,9 @@ def findings(label: str, outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def _apart(what: str, figure: Figure, outcomes: Sequence[Outcome]) -> str:
+def _apart(what: str, pick: Pick, groups: Groups) -> str:
     """Whether the paper's five variants differ by more than seeds do."""
-    five = [figure.of(outcomes, name) for name in PAPER]
+    five = [spread(groups[name], pick) for name in PAPER]
     means = [s.mean for s in five if np.isfinite(s.mean)]
     if not means:
         return f"{what}: no clip has such a rating, given or predicted."
@@ -109,7 +150,8 @@ def _apart(what: str, figure: Figure, outcomes: Sequence[Outcome]) -> str:
         return f"{begin}, **of one seed, which shows no spread: nothing can be said**."
     versus = f"than the spread of one variant over seeds, {noise:.1f} points"
     begin += f", **less {versus}**." if apart < noise else f", more {versus}."
-    others = [name for name in PAPER if name != PAPERS_CHOICE and figure.differs(outcomes, name)]
+    choice = groups[PAPERS_CHOICE]
+    others = [n for n in PAPER if n != PAPERS_CHOICE and differs(paired(pick, groups[n], choice))]
     if not others:
         return f"{begin} **Seed by seed, none can be told from the additional layer.**"
     return f"{begin} Seed by seed, only these can be told from the additional layer: {', '.join(others)}."

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 from onedemo.experiments.jobs.method import method_job
-from onedemo.experiments.report.blocks import Block, Chart, Document, Line, Reference, Text
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.statistics import spread
-from onedemo.experiments.tables import backflip
-from onedemo.experiments.tables.summary import Groups, each_seed, figure, minutes, table
+from onedemo.experiments.report.blocks import Block, Chart, Line, Reference
+from onedemo.experiments.runner import Job
+from onedemo.experiments.statistics import Spread, spread
+from onedemo.experiments.tables import backflip, parts
+from onedemo.experiments.tables.parts import Groups, columns, figure
 
-TITLE = "onedemo: how many ratings"
-SEEDS = 5
 STEPS = backflip.STEPS
 """Control steps of practice: the runs with 100 and 350 ratings serve both tables."""
 RATINGS = (25, 50, 100, 200, 350, 700)
@@ -27,7 +26,7 @@ def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
     """Seed by seed; quick: the paper's method with the larger number alone."""
     steps, numbers = (QUICK_STEPS, QUICK_RATINGS) if quick else (STEPS, RATINGS)
     return [
-        method_job(_label(method, ratings), seed, method=method, ratings=ratings, steps=steps)
+        method_job(f"{method}, {ratings} ratings", seed, method=method, ratings=ratings, steps=steps)
         for seed in seeds
         for method in METHODS
         for ratings in numbers
@@ -35,85 +34,76 @@ def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
     ]
 
 
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """The chart with the paper's point in it, and figures."""
-    groups = by_label(outcomes)
-    steps = max(outcome.job.settings["steps"] for outcome in outcomes)
-    paper = f"the paper, {_PAPER_RATINGS} ratings of a person"
-    blocks: list[Block] = [
-        Text(
-            f"The tumbling demo of 8 s, a rater without error, {steps:,} control steps of practice; four of "
-            "seven ratings before practice, the others during its first half."
-        ),
-        *_chart(
-            groups, "net_turns", name="ratings", title="Net backward turns by number of ratings",
-            y_label="turns, mean of 16 episodes",
-            reference=Reference(label=paper, y=_PAPER_TURNS, x=_PAPER_RATINGS),
-        ),
-        Text(_fewest(groups)),
-        table(_FIGURES, groups, "Mean of 16 episodes; mean ± deviation over seeds"),
-        each_seed(_EACH, groups, "Each seed, mean of 16 episodes"),
-        *_chart(
-            groups, "backflip_reward", name="ratings_reward", title="Backflip reward by number of ratings",
-            y_label="reward, mean of 16 episodes",
-            reference=Reference(label=paper, y=_PAPER_REWARD, x=_PAPER_RATINGS),
-        ),
-    ]  # fmt: skip
-    return Document(title=TITLE, blocks=blocks)
+def _by_ratings(groups: Groups, method: str, name: str) -> dict[int, Spread]:
+    """Number of ratings to a figure of the runs of a method, ascending."""
+    found = {}
+    for group in groups.values():
+        given = group[0].job.settings
+        if given["method"] == method:
+            found[given["ratings"]] = spread(group, figure(name))
+    return dict(sorted(found.items()))
 
 
-def _label(method: str, ratings: int) -> str:
-    return f"{method}, {ratings} ratings"
+@dataclass(frozen=True, slots=True)
+class _Chart:
+    """A figure against the number of ratings, a line for each method, and the paper's point."""
 
+    figure: str
+    name: str
+    title: str
+    y_label: str
+    paper: float
 
-def _chart(
-    groups: Groups, name_of_figure: str, *, name: str, title: str, y_label: str, reference: Reference
-) -> list[Chart]:
-    lines = []
-    for method in METHODS:
-        points = []
-        for group in groups.values():
-            settings = group[0].job.settings
-            over_seeds = spread(group, figure(name_of_figure))
-            if settings["method"] == method and over_seeds.missing < len(over_seeds.values):
-                points.append((settings["ratings"], over_seeds))
-        points.sort(key=lambda point: point[0])
-        if points:
-            lines.append(
-                Line(
-                    label=method, x=[ratings for ratings, _ in points], y=[s.mean for _, s in points],
-                    low=[s.low for _, s in points], high=[s.high for _, s in points], marks=True,
-                )
+    def __call__(self, groups: Groups) -> Iterable[Block]:
+        lines = []
+        for method in METHODS:
+            found = _by_ratings(groups, method, self.figure)
+            there = {n: over for n, over in found.items() if over.missing < len(over.values)}
+            if there:
+                y, low, high = ([getattr(s, k) for s in there.values()] for k in ("mean", "low", "high"))
+                lines.append(Line(label=method, x=list(there), y=y, low=low, high=high, marks=True))
+        label = f"the paper, {_PAPER_RATINGS} ratings of a person"
+        if lines:
+            yield Chart(
+                name=self.name, title=f"{self.title} by number of ratings", x_label="ratings",
+                y_label=f"{self.y_label}, mean of 16 episodes", lines=lines, log_x=True,
+                references=[Reference(label=label, y=self.paper, x=_PAPER_RATINGS)],
+                note="Dots: mean over seeds; band: least to most of them.",
             )  # fmt: skip
-    chart = Chart(
-        name=name, title=title, x_label="ratings", y_label=y_label, lines=lines, references=[reference],
-        log_x=True, note="Dots: mean over seeds; band: least to most of them.",
-    )  # fmt: skip
-    return [chart] if lines else []
 
 
-def _fewest(groups: Groups) -> str:
+def _fewest(groups: Groups, method: str) -> str:
     """The fewest ratings with which every seed turns as often as the paper's agent."""
-    parts = []
-    for method in METHODS:
-        enough = [
-            group[0].job.settings["ratings"]
-            for group in groups.values()
-            if group[0].job.settings["method"] == method
-            and spread(group, figure("net_turns")).count(_PAPER_TURNS) == len(group)
-        ]
-        parts.append(f"{method}: **{min(enough)}**" if enough else f"{method}: with none of these numbers")
-    return f"Fewest ratings with which every seed makes at least {_PAPER_TURNS:g} turns: {'; '.join(parts)}."
+    found = _by_ratings(groups, method, "net_turns")
+    enough = [n for n, turns in found.items() if turns.count(_PAPER_TURNS) == len(turns.values)]
+    return f"**{min(enough)}**" if enough else "with none of these numbers"
 
 
 _FIGURES = {
-    "net turns": figure("net_turns"),
+    **columns("net turns"),
     "best": figure("net_turns", "best"),
-    "clean turns": figure("clean_turns"),
-    "backflip reward": figure("backflip_reward"),
-    "similarity, aligned": figure("aligned_similarity"),
-    "demo's own states": lambda result: result["demo_rated"],
-    "shuffled": lambda result: result["demo_shuffled"],
-    "minutes": minutes,
+    **columns("clean turns", "backflip reward", "similarity, aligned"),
+    **columns("demo's own states", "shuffled", "minutes"),
 }
-_EACH = {"net turns": figure("net_turns"), "backflip reward": figure("backflip_reward")}
+
+TABLE = parts.Experiment(
+    title="onedemo: how many ratings", seeds=5, plan=plan,
+    parts=[
+        parts.Worded(
+            "The tumbling demo of 8 s, a rater without error, {steps:,} control steps of practice; four of "
+            "seven ratings before practice, the others during its first half.",
+            parts.settings,
+        ),
+        _Chart("net_turns", "ratings", "Net backward turns", "turns", _PAPER_TURNS),
+        parts.Worded(
+            "Fewest ratings with which every seed makes at least {turns:g} turns: onedemo: {onedemo}; "
+            "paper: {paper}.",
+            lambda groups: {"turns": _PAPER_TURNS, **{name: _fewest(groups, name) for name in METHODS}},
+        ),
+        parts.Figures(_FIGURES, parts.OVER_SEEDS),
+        parts.Figures(
+            columns("net turns", "backflip reward"), "Each seed, mean of 16 episodes", parts.each
+        ),
+        _Chart("backflip_reward", "ratings_reward", "Backflip reward", "reward", _PAPER_REWARD),
+    ],
+)  # fmt: skip

@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from onedemo.demos.library import find_demo
-from onedemo.errors import UserError
 from onedemo.experiments.jobs.method import method_job
 from onedemo.experiments.jobs.transfer import transfer_job
-from onedemo.experiments.report.blocks import Block, Document, Heading, Picture, Table, Text, number
-from onedemo.experiments.report.strip import strip
-from onedemo.experiments.runner import Job, Outcome, by_label
-from onedemo.experiments.statistics import spread, spread_of
-from onedemo.experiments.tables.summary import (
-    Groups,
-    curves,
-    each_seed,
-    figure,
-    median_outcome,
-    minutes,
-    moving_pictures,
-    table,
-)
+from onedemo.experiments.report.blocks import Block, Heading, Table, Text, number
+from onedemo.experiments.runner import Job, Outcome
+from onedemo.experiments.statistics import Spread, spread, spread_of
+from onedemo.experiments.tables import parts
+from onedemo.experiments.tables.episode import BESIDE, Episode
+from onedemo.experiments.tables.parts import Groups, Pick, columns, figure
 
-TITLE = "onedemo: from one move to another"
-SEEDS = 5
 RATINGS, PRETRAIN = 55, 30
 """In all, and of these before practice: the paper's."""
 SOURCE_RATINGS = 350
@@ -44,6 +31,7 @@ _HOP, _FLIP = "hopper-hop", "hopper-backflip"
 _TRPO = "TRPO, hand-coded reward"
 _METHODS = ("onedemo", "paper")
 _RATIO, _BEYOND = 1.5, 767.0
+"""Goals, set before any of these runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +41,10 @@ class Direction:
     title: str
     source: str
     target: str
-    figure: str
-    """What the target move is measured by."""
-    figure_name: str
+    figures: tuple[str, ...]
+    """What the target move is measured by, the main one first."""
+    part: str
+    """Of 16 episodes: the "best", as the paper's is the maximum, or the "mean"."""
 
     def label(self, method: str, tuned: bool) -> str:
         """Of the jobs of one method."""
@@ -67,8 +56,8 @@ class Direction:
         return f"{self.title}: {_TRPO}"
 
 
-THERE = Direction("backflip to hop", _FLIP, _HOP, "hop_return", "hopping return")
-BACK = Direction("hop to backflip", _HOP, _FLIP, "backflip_reward", "backflip reward")
+THERE = Direction("backflip to hop", _FLIP, _HOP, ("hop_return", "hop_reward"), "best")
+BACK = Direction("hop to backflip", _HOP, _FLIP, ("backflip_reward",), "mean")
 
 PAPER = {"TRPO": 1006.89, "fine-tuned": 767.16, "from scratch": 433.28}
 """Table 3 of Gandhi et al. 2019: hopping reward, one run each."""
@@ -104,184 +93,125 @@ def _pair(direction: Direction, method: str, seed: int, quick: bool) -> list[Job
     return [target, transfer_job(direction.label(method, tuned=True), seed, source=source, target=target)]
 
 
-def report(outcomes: Sequence[Outcome], *, quick: bool) -> Document:
-    """The paper's figures beside ours, goals, curves, strips and moving pictures."""
-    groups = by_label(outcomes)
-    goals = _goals(groups)
-    blocks: list[Block] = [
-        Text(_INTRODUCTION),
-        Heading("What should be reached"),
-        goals,
-        Heading("Hopping from a predictor of the backflip"),
-        _papers_table(groups),
-        *_direction(THERE, groups),
-    ]
-    if any(label.startswith(BACK.title) for label in groups):
-        blocks += [Heading("A backflip from a predictor of the hop"), *_direction(BACK, groups)]
-    pictures = {THERE.label("onedemo", tuned=True): "hop_transferred.webp"}
-    blocks += [
-        Text(_EXPLANATIONS),
-        Heading("What it looks like"),
-        *_strips(groups),
-        *moving_pictures(groups, pictures),
-    ]
-    data = {
-        "paper": PAPER,
-        "goals": [dict(zip(goals.heads, row, strict=True)) for row in goals.rows],
-        "ratios": {key: spread_of(values).values for key, values in _ratios(groups).items()},
-    }
-    return Document(title=TITLE, blocks=blocks, data=data)
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """One figure of runs that are fine-tuned and of runs from scratch, over seeds."""
+
+    tuned: Spread
+    scratch: Spread
+    ratios: Spread
+    """Seed by seed."""
+
+    def verdict(self, met: bool) -> str:
+        """Nothing is claimed while a seed is missing."""
+        return "open" if self.tuned.missing or self.scratch.missing else "**met**" if met else "missed"
 
 
-def _direction(direction: Direction, groups: Groups) -> list[Block]:
-    own = {label: group for label, group in groups.items() if label.startswith(direction.title)}
-    short = {label.removeprefix(f"{direction.title}: "): group for label, group in own.items()}
-    name = "hop" if direction is THERE else "backflip"
-    return [
-        table(_FIGURES[direction.figure], short, "Mean of 16 episodes; mean ± deviation over seeds"),
-        each_seed(_EACH[direction.figure], short, "Each seed"),
-        *curves(
-            short, direction.figure, name=f"{name}_curve", y_label=direction.figure_name,
-            title=f"{direction.figure_name}, {direction.title}",
-        ),
-    ]  # fmt: skip
+def _by_seed(outcomes: Sequence[Outcome], pick: Pick) -> dict[int, float | None]:
+    return {o.job.seed: None if o.result is None else pick(o.result) for o in outcomes}
 
 
-def _papers_table(groups: Groups) -> Table:
-    """The paper's Table 3, and the same of ours: the best episode, as the paper's is the maximum."""
+def _pairs(groups: Groups) -> dict[tuple[Direction, str, str], _Pair]:
+    """By direction, method and figure; those of which one half was not planned are left out."""
+    pairs = {}
+    for way in (THERE, BACK):
+        labels = {method: [way.label(method, tuned) for tuned in (True, False)] for method in _METHODS}
+        for name in way.figures:
+            pick = figure(name, way.part)
+            for method, two in labels.items():
+                if all(label in groups for label in two):
+                    tuned, scratch = (groups[label] for label in two)
+                    less = _by_seed(scratch, pick)
+                    ratios = [
+                        value / base if value is not None and (base := less.get(seed) or 0) > 0 else None
+                        for seed, value in _by_seed(tuned, pick).items()
+                    ]
+                    pair = _Pair(spread(tuned, pick), spread(scratch, pick), spread_of(ratios))
+                    pairs[way, method, name] = pair
+    return pairs
+
+
+def goals(groups: Groups) -> Iterable[Block]:
+    """A table of them, over the means of the seeds."""
     rows = []
-    for ours, theirs in ((THERE.baseline, "TRPO"), *_labels(THERE)):
-        best = spread(groups.get(ours, ()), figure("hop_return", "best"))
-        whole = spread(groups.get(ours, ()), figure("hop_reward", "best"))
-        ratings = 0 if theirs == "TRPO" else RATINGS
-        if ours in groups:
-            name = ours.removeprefix(f"{THERE.title}: ")
-            rows.append((name, ratings, PAPER[theirs], str(best), str(whole)))
-    heads = ("", "ratings", "paper", "return until the fall, best of 16", "reward of 8 s, best of 16")
-    return Table(heads=heads, rows=rows, title="Table 3")
-
-
-def _labels(direction: Direction) -> list[tuple[str, str]]:
-    return [
-        (direction.label(method, tuned), "fine-tuned" if tuned else "from scratch")
-        for method in _METHODS
-        for tuned in (True, False)
-    ]
-
-
-def _ratios(groups: Groups) -> dict[str, list[float | None]]:
-    """Fine-tuned over scratch, seed by seed, of the figure of each direction and of the hop's reward."""
-    ratios = {}
-    for direction, name in ((THERE, "hop_return"), (THERE, "hop_reward"), (BACK, "backflip_reward")):
-        for method in _METHODS:
-            pair = [groups.get(direction.label(method, tuned)) for tuned in (True, False)]
-            if pair[0] is None or pair[1] is None:
-                continue
-            part = "best" if direction is THERE else "mean"
-            each = [_by_seed(group, name, part) for group in pair if group is not None]
-            ratios[f"{direction.title}, {method}, {name}"] = [
-                each[0][seed] / each[1][seed] if _both_there(each, seed) else None for seed in each[0]
-            ]
-    return ratios
-
-
-def _by_seed(group: Sequence[Outcome], name: str, part: str) -> dict[int, Any]:
-    pick = figure(name, part)
-    return {o.job.seed: None if o.result is None else pick(o.result) for o in group}
-
-
-def _both_there(each: Sequence[Mapping[int, Any]], seed: int) -> bool:
-    tuned, scratch = each[0].get(seed), each[1].get(seed)
-    return tuned is not None and scratch is not None and scratch > 0
-
-
-def _goals(groups: Groups) -> Table:
-    """The project's, set before any of these runs: over the means of the seeds."""
-    rows = []
-    for name, ratio in _ratios(groups).items():
-        direction, method, _ = name.split(", ")
-        way = THERE if direction == THERE.title else BACK
-        figure_name, part = name.rsplit(", ", 1)[1], "best" if way is THERE else "mean"
-        pair = [
-            spread(groups[way.label(method, tuned)], figure(figure_name, part)) for tuned in (True, False)
-        ]
-        missing = any(each.missing for each in pair)
-        of_means = pair[0].mean / pair[1].mean if pair[1].mean > 0 else np.nan
-        verdict = "open" if missing else "**met**" if of_means >= _RATIO else "missed"
-        rows.append(
-            (name, f"{_RATIO:g} x scratch", str(pair[0]), str(pair[1]), number(of_means),
-             spread_of(ratio).each, verdict)
-        )  # fmt: skip
+    for (way, method, name), pair in _pairs(groups).items():
+        what, both = f"{way.title}, {method}, {name}", (str(pair.tuned), str(pair.scratch))
+        ratio = pair.tuned.mean / pair.scratch.mean if pair.scratch.mean > 0 else np.nan
+        verdict = pair.verdict(ratio >= _RATIO)
+        rows.append((what, f"{_RATIO:g} x scratch", *both, number(ratio), pair.ratios.each, verdict))
         if way is THERE:
-            beyond = "open" if missing else "**met**" if pair[0].mean >= _BEYOND else "missed"
-            rows.append((name, f"beyond: {_BEYOND:g}", str(pair[0]), str(pair[1]), "", pair[0].each, beyond))
-    heads = (
-        "direction, method, figure",
-        "reach",
-        "fine-tuned",
-        "from scratch",
-        "ratio",
-        "each seed",
-        "verdict",
-    )
-    return Table(
-        heads=heads, rows=rows,
+            verdict = pair.verdict(pair.tuned.mean >= _BEYOND)
+            rows.append((what, f"beyond: {_BEYOND:g}", *both, "", pair.tuned.each, verdict))
+    yield Table(
+        heads=(
+            "direction, method, figure", "reach", "fine-tuned", "from scratch", "ratio", "each seed",
+            "verdict",
+        ),
+        rows=rows,
         notes=("Hop: best of 16 episodes, as the paper's is the maximum; backflip: mean of 16. Ratio: of the "
                "means over seeds; of each seed beside it.",),
     )  # fmt: skip
 
 
-def _strips(groups: Groups) -> list[Block]:
-    """The paper's figure: the first two seconds of the hop, demo above robot."""
-    blocks: list[Block] = []
-    for tuned, name in ((True, "hop_fine_tuned"), (False, "hop_scratch")):
-        label = THERE.label("onedemo", tuned)
-        median = median_outcome(groups.get(label, ()), figure("hop_reward"))
-        if median is None or median.result is None:
-            continue
-        demo = find_demo(THERE.target, Path())
-        try:
-            data = strip(demo, np.array(median.result["episode"]["qpos"]), first=0.1, last=0.35)
-        except UserError:
-            continue  # a machine that cannot draw; the figures stand without
-        text = f"above the demo, below {label}, seed {median.job.seed} (the median), at the same times"
-        blocks.append(
-            Picture(name=f"{name}.webp", data=data, alt=text, note=text[0].upper() + text[1:] + ".")
+def _papers_table(groups: Groups) -> Iterable[Block]:
+    """The paper's Table 3, and the same of ours: the best episode, as the paper's is the maximum."""
+    labels = {THERE.baseline: "TRPO"} | {
+        THERE.label(method, tuned): "fine-tuned" if tuned else "from scratch"
+        for method in _METHODS
+        for tuned in (True, False)
+    }
+    rows = [
+        (
+            ours.removeprefix(f"{THERE.title}: "), 0 if theirs == "TRPO" else RATINGS, PAPER[theirs],
+            *(str(spread(groups[ours], figure(name, "best"))) for name in THERE.figures),
         )
-    return blocks
+        for ours, theirs in labels.items()
+        if ours in groups
+    ]  # fmt: skip
+    heads = ("", "ratings", "paper", "return until the fall, best of 16", "reward of 8 s, best of 16")
+    yield Table(heads=heads, rows=rows, title="Table 3")
 
 
-_FIGURES = {
-    "hop_return": {
-        "return until the fall": figure("hop_return"),
-        "best": figure("hop_return", "best"),
-        "upright, s": figure("upright_seconds"),
-        "reward of 8 s": figure("hop_reward"),
-        "its best": figure("hop_reward", "best"),
-        "similarity, aligned": figure("aligned_similarity"),
-        "ratings": lambda result: result["ratings"],
-        "minutes": minutes,
-    },
-    "backflip_reward": {
-        "backflip reward": figure("backflip_reward"),
-        "best": figure("backflip_reward", "best"),
-        "net turns": figure("net_turns"),
-        "most": figure("net_turns", "best"),
-        "similarity, aligned": figure("aligned_similarity"),
-        "ratings": lambda result: result["ratings"],
-        "minutes": minutes,
-    },
+def _direction(
+    way: Direction, heading: str, means: Mapping[str, Pick], seeds: Mapping[str, Pick],
+    curve: tuple[str, str], *first: parts.Part,
+) -> list[parts.Part]:  # fmt: skip
+    """A section; the labels in it lack the direction."""
+
+    def own(groups: Groups) -> Groups:
+        return {label: group for label, group in groups.items() if label.startswith(way.title)}
+
+    def short(groups: Groups) -> Groups:
+        return {label.removeprefix(f"{way.title}: "): group for label, group in groups.items()}
+
+    name, what = curve
+    inner = [
+        parts.Figures(means, parts.OVER_SEEDS),
+        parts.Figures(seeds, "Each seed", parts.each),
+        parts.Curves(way.figures[0], name, f"{what}, {way.title}", what),
+    ]
+    return [parts.Section(heading, [*first, parts.Section("", inner, short)], own)]
+
+
+_COMMON = columns("similarity, aligned", "ratings", "minutes")
+_HOPS = {
+    **columns("return until the fall"),
+    "best": figure("hop_return", "best"),
+    **columns("upright, s", "reward of 8 s"),
+    "its best": figure("hop_reward", "best"),
+    **_COMMON,
 }
-_EACH = {
-    "hop_return": {
-        "return until the fall, best of 16": figure("hop_return", "best"),
-        "reward of 8 s, best of 16": figure("hop_reward", "best"),
-        "similarity, aligned": figure("aligned_similarity"),
-    },
-    "backflip_reward": {
-        "backflip reward": figure("backflip_reward"),
-        "net turns": figure("net_turns"),
-    },
+_EACH_HOP = {
+    "return until the fall, best of 16": figure("hop_return", "best"),
+    "reward of 8 s, best of 16": figure("hop_reward", "best"),
+    **columns("similarity, aligned"),
+}
+_FLIPS = {
+    **columns("backflip reward"),
+    "best": figure("backflip_reward", "best"),
+    **columns("net turns"),
+    "most": figure("net_turns", "best"),
+    **_COMMON,
 }
 _INTRODUCTION = (
     "A predictor that learned the backflip from 350 ratings is fine-tuned to the hop with 55 (30 before "
@@ -296,3 +226,41 @@ _EXPLANATIONS = (
     "paper does not say which of the two its hopping reward is. **Minutes**: of the second run, without "
     "evaluation. The first run is trained for 300,000 steps: its policy is not used."
 )
+_ABOVE = "bove the demo, below {label}, seed {seed} (the median), at the same times"
+
+
+def _strip(tuned: bool, name: str) -> Episode:
+    """The paper's figure: the first two seconds of the hop, demo above robot."""
+    label = THERE.label("onedemo", tuned)
+    return Episode(label, name, f"a{_ABOVE}", f"A{_ABOVE}.", figure="hop_reward", part=(0.1, 0.35))
+
+
+def _data(groups: Groups) -> dict[str, Any]:
+    ratios = {
+        f"{way.title}, {method}, {name}": pair.ratios.values
+        for (way, method, name), pair in _pairs(groups).items()
+    }
+    return {"paper": PAPER, "ratios": ratios}
+
+
+TABLE = parts.Experiment(
+    title="onedemo: from one move to another", seeds=5, plan=plan, data=_data,
+    parts=[
+        Text(_INTRODUCTION),
+        Heading("What should be reached"),
+        goals,
+        *_direction(
+            THERE, "Hopping from a predictor of the backflip", _HOPS, _EACH_HOP,
+            ("hop_curve", "hopping return"), _papers_table,
+        ),
+        *_direction(
+            BACK, "A backflip from a predictor of the hop", _FLIPS, columns("backflip reward", "net turns"),
+            ("backflip_curve", "backflip reward"),
+        ),
+        Text(_EXPLANATIONS),
+        Heading("What it looks like"),
+        _strip(True, "hop_fine_tuned.webp"),
+        _strip(False, "hop_scratch.webp"),
+        Episode(THERE.label("onedemo", True), "hop_transferred.webp", BESIDE),
+    ],
+)  # fmt: skip
