@@ -19,7 +19,7 @@ from onedemo.app.cli.people import add_people_commands
 from onedemo.core.process import prepare_process
 from onedemo.errors import UserError
 
-_APP_ONLY = ("aiohttp", "krippendorff", "mjviser", "msgspec", "packaging", "pyarrow", "viser")
+_APP_ONLY = ("aiohttp", "jinja2", "krippendorff", "markupsafe", "mjviser", "packaging", "pyarrow", "viser")
 """Packages of the extra ``app``: the library does without, the page and the data set do not."""
 
 

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from onedemo.reward.model import CLASSES, Snapshot
+from onedemo.reward.settings import PracticeConfig
 from onedemo.rl.rollouts import EpisodeRules, Rollouts, Starts, Step
 
 _MOVES = np.arange(4)
@@ -42,34 +43,6 @@ _BANK_TRIES = 8000
 """Random states compared with each of them."""
 _BANK_KEPT = 12
 """Of these, the ones most like it are kept."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PracticeConfig:
-    """How the policy practises."""
-
-    elastic: bool = True
-    """The demo's clock waits for the robot and hurries after it; False: it runs in real time."""
-    slack_seconds: float = 0.6
-    """How far the elastic clock may be from real time, either way."""
-    bank_share: float = 0.5
-    """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
-    give_up: float = 0.3
-    """An episode ends when the running similarity falls below this share of that of the bank's states,
-    the most that the predictor gives; 0: never."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.bank_share <= 1:
-            raise ValueError(f"practice.bank_share must be in 0..1, got {self.bank_share}")
-        if not 0 <= self.give_up < 1:
-            raise ValueError(f"practice.give_up must be in 0..1, got {self.give_up}")
-        if self.slack_seconds < 0:
-            raise ValueError(f"practice.slack_seconds must be at least 0, got {self.slack_seconds}")
-
-    @property
-    def plain(self) -> bool:
-        """Whether nothing of it follows the predictor step by step: the paper's practice."""
-        return not (self.elastic or self.bank_share or self.give_up)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
