@@ -5,16 +5,17 @@ An unknown key is an error that names the nearest valid one. ``section.key=value
 
 from __future__ import annotations
 
+import ast
 import difflib
 import json
 import math
 import re
-import tomllib
-from dataclasses import asdict, dataclass, field
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from onedemo.core.ranges import at_least, one_of
 from onedemo.errors import UserError
@@ -110,9 +111,9 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     Raises:
         UserError: If the file cannot be read, a key does not exist or a value does not fit.
     """
-    in_file = _flat(_read(path)) if path is not None else {}
-    given = in_file | (overrides := _flat(overrides or {}))
-    known = _flat(asdict(RunConfig()))
+    in_file = _by_key(_read(path)) if path is not None else {}
+    given = in_file | (overrides := _by_key(overrides or {}))
+    known = _by_key(asdict(RunConfig()))
 
     def wrong(key: str, said: str) -> UserError:
         return UserError(f"{path}: {said}" if key in in_file.keys() - overrides.keys() else said)
@@ -126,6 +127,8 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
             raise wrong(key, f"unknown key {key!r}; the nearest valid one is {nearest!r}")
         if isinstance(value, float) and isinstance(known.get(key), float) and not math.isfinite(value):
             raise wrong(key, f"{key} must be a finite number, got {value}")
+    import msgspec  # here: the help does without
+
     tree: dict[str, Any] = {}
     for key, value in (known | METHODS.get(str(given.get("method")), {}) | given).items():
         *section, name = key.split(".")
@@ -148,6 +151,8 @@ _TYPES = {
 
 
 def _read(path: Path) -> dict[str, Any]:
+    import tomllib
+
     try:
         return tomllib.loads(path.read_text())
     except (OSError, UnicodeDecodeError) as error:
@@ -156,20 +161,35 @@ def _read(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} is not valid TOML: {error}") from None
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+def _by_key(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Dotted keys to values; an empty section is a value."""
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         nested = isinstance(value, dict) and value
-        flat |= _flat(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+        flat |= _by_key(value, f"{prefix}{name}.") if nested else {prefix + name: value}
     return flat
 
 
 def settings_for_another(config: RunConfig, method: str) -> dict[str, Any]:
     """A run's settings as overrides for ``load_config``; for another method those that none decides."""
     decided = set() if method == config.method else set().union(*METHODS.values())
-    flat = _flat(asdict(config))
+    flat = _by_key(asdict(config))
     return {key: value for key, value in flat.items() if key not in decided} | {"method": method}
+
+
+def describe(config: Any = None, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Of each setting its dotted key, its default in TOML, and the docstring beneath it on one line."""
+    config = RunConfig() if config is None else config
+    module = ast.parse(Path(sys.modules[type(config).__module__].__file__ or "").read_text())
+    (body,) = (node.body for node in module.body if getattr(node, "name", "") == type(config).__name__)
+    said = {ast.unparse(a.target): ast.literal_eval(b.value) for a, b in pairwise(body)
+            if isinstance(a, ast.AnnAssign) and isinstance(b, ast.Expr)}  # fmt: skip
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            yield from describe(value, f"{entry.name}.")
+        else:
+            yield prefix + entry.name, json.dumps(value), " ".join(said[entry.name].split())
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -178,6 +198,8 @@ def parse_override(text: str) -> tuple[str, Any]:
     Raises:
         UserError: If there is no ``=``.
     """
+    import tomllib
+
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise UserError(f"--set takes section.key=value, got {text!r}")
