@@ -5,61 +5,23 @@ An unknown key is an error that names the nearest valid one. ``section.key=value
 
 from __future__ import annotations
 
-import dataclasses
+import ast
 import difflib
+import json
 import math
 import re
-import tomllib
-from dataclasses import dataclass, field
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any
 
+from onedemo.core.ranges import at_least, one_of
 from onedemo.errors import UserError
-from onedemo.queries.selection import CHOICES
-from onedemo.reward.episode_rules import PracticeConfig
-from onedemo.reward.model import PredictorConfig
-from onedemo.rl.policy import PolicyConfig
-from onedemo.rl.trpo import TrpoConfig
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RatingsConfig:
-    """What raters are asked. Defaults: the paper's section "Evaluation of learning from observations"."""
-
-    pretrain: int = 200
-    """Ratings of clips of a random policy, before the policy is trained."""
-    online: int = 150
-    """Ratings of clips of the policy in training."""
-    clip_seconds: float = 0.3
-    """Length of a clip."""
-    starts: str = "random"
-    """Where the clips before practice come from: "random" states of the robot, or, as in the paper, a
-    random policy that starts "standing"."""
-    pairing: str = "any"
-    """Before practice a clip is asked beside "any" moment of the demo, or beside the same "time"."""
-    choice: str = "mix"
-    """Which of the possible clips are asked: "uniform"; those rated "high"; those of most "disagreement"
-    between the predictor's members; or a "mix" of all three. All but the first spread over the demo."""
-    rounds: int = 10
-    """A simulated rater's first ratings come in so many rounds, with a refit after each."""
-    queue: int = 12
-    """Clips kept ready to be rated."""
-    stale_iterations: int = 10
-    """A clip that nobody has rated is withdrawn after so many iterations: the policy has moved on."""
-    online_share: float = 0.5
-    """A simulated rater gives its online ratings evenly over this first share of the training."""
-
-    def __post_init__(self) -> None:
-        _at_least(self, "ratings", pretrain=1, online=0, rounds=1, queue=1, stale_iterations=1)
-        if not 0.05 <= self.clip_seconds <= 5:
-            raise ValueError(f"ratings.clip_seconds must be 0.05 to 5 s, got {self.clip_seconds}")
-        _one_of("ratings.starts", self.starts, ("random", "standing"))
-        _one_of("ratings.pairing", self.pairing, ("any", "time"))
-        _one_of("ratings.choice", self.choice, tuple(CHOICES))
-        if not 0 < self.online_share <= 1:
-            raise ValueError(f"ratings.online_share must be in (0, 1], got {self.online_share}")
+from onedemo.queries.settings import RatingsConfig
+from onedemo.reward.settings import PracticeConfig, PredictorConfig
+from onedemo.rl.settings import PolicyConfig, TrpoConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,7 +40,7 @@ class RolloutConfig:
     """Where the robot is simulated: "mujoco", the processor, or "warp", an NVIDIA GPU (extra ``warp``)."""
 
     def __post_init__(self) -> None:
-        _at_least(self, "rollouts", lanes=1, steps=1, total_steps=1, threads=1)
+        at_least("rollouts", self, lanes=1, steps=1, total_steps=1, threads=1)
         if self.physics not in ("mujoco", "warp"):
             raise ValueError(f"rollouts.physics must be 'mujoco' or 'warp', got {self.physics!r}")
 
@@ -126,7 +88,7 @@ class RunConfig:
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
 
     def __post_init__(self) -> None:
-        _one_of("method", self.method, tuple(METHODS))
+        one_of("method", self.method, METHODS)
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
@@ -149,43 +111,85 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     Raises:
         UserError: If the file cannot be read, a key does not exist or a value does not fit.
     """
+    in_file = _by_key(_read(path)) if path is not None else {}
+    given = in_file | (overrides := _by_key(overrides or {}))
+    known = _by_key(asdict(RunConfig()))
+
+    def wrong(key: str, said: str) -> UserError:
+        return UserError(f"{path}: {said}" if key in in_file.keys() - overrides.keys() else said)
+
+    for key, value in given.items():
+        if any(other.startswith(f"{key}.") for other in known):
+            if value != {}:
+                raise wrong(key, f"{key} is a section, not a value")
+        elif key not in known:
+            nearest = difflib.get_close_matches(key, known, n=1, cutoff=0)[0]
+            raise wrong(key, f"unknown key {key!r}; the nearest valid one is {nearest!r}")
+        if isinstance(value, float) and isinstance(known.get(key), float) and not math.isfinite(value):
+            raise wrong(key, f"{key} must be a finite number, got {value}")
+    import msgspec  # here: the help does without
+
     tree: dict[str, Any] = {}
-    if path is not None:
-        try:
-            tree = tomllib.loads(path.read_text())
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"cannot read the config file {path}: {error}") from None
-        except tomllib.TOMLDecodeError as error:
-            raise UserError(f"{path} is not valid TOML: {error}") from None
-    for dotted, value in (overrides or {}).items():
-        branch, key = _place(tree, dotted)
-        branch[key] = value
-    for dotted, value in METHODS.get(str(tree.get("method")), {}).items():
-        branch, key = _place(tree, dotted)
-        branch.setdefault(key, value)
-    return _build(RunConfig(), tree, "")
+    for key, value in (known | METHODS.get(str(given.get("method")), {}) | given).items():
+        *section, name = key.split(".")
+        if value != {} or key in known:
+            (tree.setdefault(section[0], {}) if section else tree)[name] = value
+    try:
+        return msgspec.convert(tree, RunConfig)
+    except msgspec.ValidationError as error:
+        if error.__cause__ is not None:  # a section's own check, whose sentence begins with the key
+            said = str(error.__cause__)
+            raise wrong(said.split()[0], said) from None
+        key = str(error).partition("`$.")[2].rstrip("`").partition("[")[0]
+        raise wrong(key, f"{key} must be {_TYPES[type(known[key])]}, got {given[key]!r}") from None
+
+
+_TYPES = {
+    int: "a whole number", float: "a number", str: "a text", bool: "true or false",
+    tuple: "a list of whole numbers",
+}  # fmt: skip
+
+
+def _read(path: Path) -> dict[str, Any]:
+    import tomllib
+
+    try:
+        return tomllib.loads(path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"cannot read the config file {path}: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"{path} is not valid TOML: {error}") from None
+
+
+def _by_key(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted keys to values; an empty section is a value."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        nested = isinstance(value, dict) and value
+        flat |= _by_key(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return flat
 
 
 def settings_for_another(config: RunConfig, method: str) -> dict[str, Any]:
     """A run's settings as overrides for ``load_config``; for another method those that none decides."""
     decided = set() if method == config.method else set().union(*METHODS.values())
-    flat: dict[str, Any] = {}
-    for name, value in tomllib.loads(to_toml(config)).items():
-        if isinstance(value, dict):
-            flat |= {f"{name}.{key}": each for key, each in value.items()}
-        else:
-            flat[name] = value
+    flat = _by_key(asdict(config))
     return {key: value for key, value in flat.items() if key not in decided} | {"method": method}
 
 
-def _place(tree: dict[str, Any], dotted: str) -> tuple[dict[str, Any], str]:
-    """The section of a dotted key, made if missing, and the key in it."""
-    *sections, key = dotted.split(".")
-    for section in sections:
-        tree = tree.setdefault(section, {})
-        if not isinstance(tree, dict):
-            raise UserError(f"{dotted}: {section!r} is a value, not a section")
-    return tree, key
+def describe(config: Any = None, prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Of each setting its dotted key, its default in TOML, and the docstring beneath it on one line."""
+    config = RunConfig() if config is None else config
+    module = ast.parse(Path(sys.modules[type(config).__module__].__file__ or "").read_text())
+    (body,) = (node.body for node in module.body if getattr(node, "name", "") == type(config).__name__)
+    said = {ast.unparse(a.target): ast.literal_eval(b.value) for a, b in pairwise(body)
+            if isinstance(a, ast.AnnAssign) and isinstance(b, ast.Expr)}  # fmt: skip
+    for entry in fields(config):
+        value = getattr(config, entry.name)
+        if is_dataclass(value):
+            yield from describe(value, f"{entry.name}.")
+        else:
+            yield prefix + entry.name, json.dumps(value), " ".join(said[entry.name].split())
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -194,6 +198,8 @@ def parse_override(text: str) -> tuple[str, Any]:
     Raises:
         UserError: If there is no ``=``.
     """
+    import tomllib
+
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise UserError(f"--set takes section.key=value, got {text!r}")
@@ -205,69 +211,10 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 def to_toml(config: Any) -> str:
     """A config tree as TOML text that ``load_config`` reads back to the same tree."""
-    lines, sections = [], []
-    for entry in dataclasses.fields(config):
-        value = getattr(config, entry.name)
-        if dataclasses.is_dataclass(value):
-            sections.append(f"\n[{entry.name}]\n{to_toml(value)}")
-        else:
-            lines.append(f"{entry.name} = {_toml_value(value)}\n")
-    return "".join(lines + sections)
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
-    return repr(value)
-
-
-def _build(default: T, tree: dict[str, Any], prefix: str) -> T:
-    hints = get_type_hints(type(default))
-    known: dict[str, Any] = {}
-    for key, value in tree.items():
-        if key not in hints:
-            nearest = difflib.get_close_matches(key, list(hints), n=1, cutoff=0)
-            raise UserError(f"unknown key {prefix + key!r}; the nearest valid one is {prefix + nearest[0]!r}")
-        hint = hints[key]
-        if dataclasses.is_dataclass(hint):
-            if not isinstance(value, dict):
-                raise UserError(f"{prefix + key} is a section, not a value")
-            known[key] = _build(getattr(default, key), value, f"{prefix}{key}.")
-        else:
-            known[key] = _fit(prefix + key, value, hint)
-    try:
-        return dataclasses.replace(default, **known)  # type: ignore[type-var]
-    except ValueError as error:
-        raise UserError(str(error)) from None
-
-
-def _fit(key: str, value: Any, hint: Any) -> Any:
-    """The value in the type of the field; whole numbers are also numbers."""
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if hint is float and isinstance(value, float) and not math.isfinite(value):
-        raise UserError(f"{key} must be a finite number, got {value}")
-    if hint in (int, float, str, bool):
-        if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
-            names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-            raise UserError(f"{key} must be {names[hint]}, got {value!r}")
-        return value
-    if not isinstance(value, list) or not all(type(item) is int for item in value):
-        raise UserError(f"{key} must be a list of whole numbers, got {value!r}")
-    return tuple(value)
-
-
-def _one_of(key: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{key} must be one of {', '.join(choices)}, got {value!r}")
-
-
-def _at_least(config: Any, section: str, **minima: int) -> None:
-    for name, minimum in minima.items():
-        if getattr(config, name) < minimum:
-            raise ValueError(f"{section}.{name} must be at least {minimum}, got {getattr(config, name)}")
+    lines, sections = "", ""
+    for name, value in (config if isinstance(config, dict) else asdict(config)).items():
+        if isinstance(value, dict):
+            sections += f"\n[{name}]\n{to_toml(value)}"
+        else:  # JSON's texts, numbers, truths and lists of them are TOML's
+            lines += f"{name} = {json.dumps(value, ensure_ascii=False)}\n"
+    return lines + sections

@@ -2,110 +2,118 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import shlex
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter
 
 from onedemo.core.files import check_writable, write_atomic
 from onedemo.errors import UserError
 from onedemo.experiments.registry import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
 
+Seeds = Annotated[
+    str | None,
+    Parameter(
+        help="How many of the reporting seeds 0, 1, 2, ..., or a list such as 3,7,9; "
+        f"settings were tuned on seeds from {TUNING_FROM} on, never on those reported."
+    ),
+]
+Quick = Annotated[bool, Parameter(help="Small and rough: under 2 minutes for speed, 5 for a table.")]
+Json = Annotated[Path | None, Parameter("--json", help="Write all figures there.")]
+Out = Annotated[Path | None, Parameter(help="Write a report with charts there.")]
 
-def add_commands(actions: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds the sub-commands.
+
+def __getattr__(name: str) -> App:
+    """``bench``: the command, with one for each table that there is when it is asked for."""
+    if name != "bench":
+        raise AttributeError(name)
+    app = App(name="bench", help="Measure the program and the method.")
+    app.command(speed)
+    for table, entry in TABLES.items():
+        app.command(_table(table), name=table, help=f"{entry.summary[0].upper()}{entry.summary[1:]}.")
+    return app
+
+
+def speed(*, part: list[str] | None = None, quick: Quick = False, json_: Json = None, out: Out = None) -> int:
+    """Speed, memory and waiting beside peers and limits.
 
     Args:
-        actions: Sub-parsers of ``onedemo bench``.
-        command: Adds one: (actions, name, run, summary) to its parser.
+        part: Only this part; may be repeated.
     """
-    speed = command(actions, "speed", _speed, "speed, memory and waiting beside peers and limits")
-    _outputs(speed, quick="small and rough: under 2 minutes")
-    speed.add_argument(
-        "--part", dest="parts", action="append", metavar="PART", help="only this part; may be repeated"
-    )
-    for name, entry in TABLES.items():
-        table = command(actions, name, _table, entry.summary)
-        table.set_defaults(table=name)
-        table.add_argument(
-            "--seeds", type=_seeds, metavar="N or LIST",
-            help="how many of the reporting seeds 0, 1, 2, ..., or a list such as 3,7,9; "
-            f"settings were tuned on seeds from {TUNING_FROM} on, never on those reported",
-        )  # fmt: skip
-        _outputs(table, quick="small and rough: under 5 minutes")
-        table.add_argument(
-            "--results", type=Path, default=Path("bench-results"), metavar="DIR",
-            help="where finished runs are kept; they are not run again (./bench-results)",
-        )  # fmt: skip
-        table.add_argument(
-            "--workers", type=_at_least_1, metavar="N", help="runs side by side (one per core)"
-        )
-        table.add_argument(
-            "--report-only", action="store_true", help="run nothing; report what there is, and what is not"
-        )
-
-
-def _outputs(parser: argparse.ArgumentParser, *, quick: str) -> None:
-    parser.add_argument("--quick", action="store_true", help=quick)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write a report with charts there")
-
-
-def _speed(arguments: argparse.Namespace) -> int:
     from onedemo.experiments.speed import parts, report
 
-    unknown = {part for part in arguments.parts or () if "." not in part} - set(parts.PARTS)
+    unknown = {name for name in part or () if "." not in name} - set(parts.PARTS)
     if unknown:
         raise UserError(f"unknown part {min(unknown)!r}; choose from: {', '.join(parts.PARTS)}")
-    _check_outputs(arguments)
+    _check_outputs(json_, out)
     began = time.monotonic()
-    results = parts.measure(quick=arguments.quick, parts=arguments.parts or parts.PARTS, tell=_tell)
-    about = report.as_json(results, command=_command_line(), seconds=time.monotonic() - began)
-    print(report.table(results))
-    if arguments.out is not None:
-        report.write_report(arguments.out, "onedemo: speed", results, about)
-    _write_json(arguments.json, about)
-    return int(any(getattr(result, "failed", False) for result in results))
+    measured = parts.measure(quick=quick, parts=part or parts.PARTS, tell=_tell)
+    about = report.as_json(measured, command=_command_line(), seconds=time.monotonic() - began)
+    print(report.table(measured))
+    if out is not None:
+        report.write_report(out, "onedemo: speed", measured, about)
+    _write_json(json_, about)
+    return int(any(getattr(result, "failed", False) for result in measured))
 
 
-def _table(arguments: argparse.Namespace) -> int:
-    from onedemo.experiments import runner
-    from onedemo.experiments.report import document
-    from onedemo.experiments.report.account import complete
+def _table(name: str) -> Any:
+    """The command of a table."""
 
-    _check_outputs(arguments)
-    _check_directory("--results", arguments.results)
-    table, quick = find_table(arguments.table), arguments.quick
-    jobs = table.plan(arguments.seeds or default_seeds(table, quick=quick), quick=quick)
-    if arguments.report_only:
-        outcomes = runner.peek(jobs, arguments.results)
-    else:
+    def table(
+        *, seeds: Seeds = None, quick: Quick = False, json_: Json = None, out: Out = None,
+        results: Path = Path("bench-results"), workers: int | None = None, report_only: bool = False,
+    ) -> int:  # fmt: skip
+        """A table.
+
+        Args:
+            results: Where finished runs are kept; they are not run again.
+            workers: Runs side by side (one per core).
+            report_only: Run nothing; report what there is, and what is not.
+        """
+        from onedemo.experiments import runner
+        from onedemo.experiments.report import document
+        from onedemo.experiments.report.account import complete
+
         try:
-            outcomes = runner.run_jobs(jobs, arguments.results, workers=arguments.workers, tell=_tell)
-        except KeyboardInterrupt:
-            _tell(
-                f"stopped; finished runs are in {arguments.results}, and the same command goes on from them"
-            )
-            raise
-    report = complete(table.report(outcomes, quick=quick), outcomes, command=_command_line(), quick=quick)
-    print(document.as_text(report))
-    if arguments.out is not None:
-        document.write(report, arguments.out)
-    _write_json(arguments.json, document.record(report))
-    return int(any(outcome.failed for outcome in outcomes))
+            numbers = parse_seeds(seeds) if seeds is not None else None
+        except ValueError as error:
+            raise UserError(f"argument --seeds: {error}") from None
+        if workers is not None and workers < 1:
+            raise UserError(f"argument --workers: must be a whole number of at least 1, got '{workers}'")
+        _check_outputs(json_, out)
+        _check_directory("--results", results)
+        asked = find_table(name)
+        jobs = asked.plan(numbers or default_seeds(asked, quick=quick), quick=quick)
+        if report_only:
+            outcomes = runner.peek(jobs, results)
+        else:
+            try:
+                outcomes = runner.run_jobs(jobs, results, workers=workers, tell=_tell)
+            except KeyboardInterrupt:
+                _tell(f"stopped; finished runs are in {results}, and the same command goes on from them")
+                raise
+        report = asked.report(outcomes, quick=quick)
+        report = complete(report, outcomes, command=_command_line(), quick=quick)
+        print(document.as_text(report))
+        if out is not None:
+            document.write(report, out)
+        _write_json(json_, document.record(report))
+        return int(any(outcome.failed for outcome in outcomes))
+
+    return table
 
 
-def _check_outputs(arguments: argparse.Namespace) -> None:
+def _check_outputs(file: Path | None, out: Path | None) -> None:
     """Raises UserError now, and not after hours of work."""
-    if arguments.json is not None:
-        check_writable(arguments.json)
-    if arguments.out is not None:
-        _check_directory("--out", arguments.out)
+    if file is not None:
+        check_writable(file)
+    if out is not None:
+        _check_directory("--out", out)
         if importlib.util.find_spec("matplotlib") is None:
             raise UserError("--out needs matplotlib for its charts: pip install -e '.[bench]'")
 
@@ -130,16 +138,3 @@ def _command_line() -> str:
 
 def _tell(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-    try:
-        return parse_seeds(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def _at_least_1(text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
-    return int(text)

@@ -2,44 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from cyclopts import Parameter
 
 from onedemo.core.files import check_writable
 from onedemo.errors import UserError
 
-
-def add_data_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds them to the command line.
-
-    Args:
-        commands: Where sub-commands are added.
-        command: Adds one: (commands, name, function, summary).
-    """
-    export = command(commands, "export", _export, "the ratings as CSV, what was rated as Parquet")
-    add_data_dir(export)
-    export.add_argument("--out", type=Path, metavar="FILE", help="the CSV; standard output if not given")
-    export.add_argument("--run", dest="run_name", metavar="NAME", help="only this run")
-    export.add_argument("--rater", metavar="NAME", help="only this rater (of the CSV)")
-    export.add_argument("--segments", type=Path, metavar="FILE", help="states and actions behind the clips")
-    export.add_argument("--comparisons", type=Path, metavar="FILE", help="answers about pairs, as CSV")
-    export.add_argument("--skips", type=Path, metavar="FILE", help="skipped clips and why, as CSV")
-    export.add_argument("--card", type=Path, metavar="FILE", help="the data card, in Markdown")
-
-    back = command(commands, "import", _import, "an export back into an empty data directory")
-    back.add_argument("ratings", type=Path, metavar="RATINGS.csv")
-    back.add_argument("segments", type=Path, metavar="SEGMENTS.parquet")
-    add_data_dir(back)
-
-
-def add_data_dir(parser: argparse.ArgumentParser) -> None:
-    """The option ``--data-dir``."""
-    parser.add_argument(
-        "--data-dir", type=Path, default=Path("data"), metavar="DIR", help="where everything is kept (./data)"
-    )
+DATA = Path("data")
+DataDir = Annotated[Path, Parameter(help="Where everything is kept.")]
 
 
 def check_output(file: Path, data_dir: Path) -> None:
@@ -49,47 +22,68 @@ def check_output(file: Path, data_dir: Path) -> None:
         raise UserError(f"{file} is the database; choose another name")
 
 
-def _export(arguments: argparse.Namespace) -> None:
-    from onedemo.app.dataset.card import card
+def export(
+    *, data_dir: DataDir = DATA, out: Path | None = None, run: str | None = None, rater: str | None = None,
+    segments: Path | None = None, comparisons: Path | None = None, skips: Path | None = None,
+    card: Path | None = None,
+) -> None:  # fmt: skip
+    """The ratings as CSV, what was rated as Parquet.
+
+    Args:
+        out: The CSV; standard output if not given.
+        run: Only this run.
+        rater: Only this rater (of the CSV).
+        segments: States and actions behind the clips.
+        comparisons: Answers about pairs, as CSV.
+        skips: Skipped clips and why, as CSV.
+        card: The data card, in Markdown.
+    """
+    from onedemo.app.dataset.card import card as card_of
     from onedemo.app.dataset.ratings_csv import csv_blocks, write_parquet
     from onedemo.core.files import write_atomic
     from onedemo.storage.comparisons import COMPARISON_COLUMNS
     from onedemo.storage.ratings import SKIP_COLUMNS
 
-    with open_store(arguments, must_exist=True) as store:
-        run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
+    with open_store(data_dir, must_exist=True) as store:
+        runs = [entry["id"] for entry in store.runs()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
-        others = (arguments.segments, arguments.comparisons, arguments.skips, arguments.card)
-        for file in (arguments.out, *others):
+        others = (segments, comparisons, skips, card)
+        for file in (out, *others):
             if file is not None:
-                check_output(file, arguments.data_dir)
-        if arguments.segments is not None:
-            write_parquet(store, run, arguments.segments)
-        if arguments.card is not None:
-            write_atomic(arguments.card, card(store, run).encode())
-        if arguments.comparisons is not None:
-            write_atomic(arguments.comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
-        if arguments.skips is not None:
-            write_atomic(arguments.skips, csv_blocks(store.iter_skips(run), SKIP_COLUMNS))
-        blocks = csv_blocks(store.iter_ratings(run, rater=arguments.rater))
-        if arguments.out is not None:
-            write_atomic(arguments.out, blocks)
+                check_output(file, data_dir)
+        if segments is not None:
+            write_parquet(store, run, segments)
+        if card is not None:
+            write_atomic(card, card_of(store, run).encode())
+        if comparisons is not None:
+            write_atomic(comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
+        if skips is not None:
+            write_atomic(skips, csv_blocks(store.iter_skips(run), SKIP_COLUMNS))
+        blocks = csv_blocks(store.iter_ratings(run, rater=rater))
+        if out is not None:
+            write_atomic(out, blocks)
         elif not any(others):
             for block in blocks:
                 sys.stdout.buffer.write(block)
             sys.stdout.buffer.flush()
 
 
-def _import(arguments: argparse.Namespace) -> None:
+def import_(ratings: Path, segments: Path, /, *, data_dir: DataDir = DATA) -> None:
+    """An export back into an empty data directory.
+
+    Args:
+        ratings: RATINGS.csv of the export.
+        segments: SEGMENTS.parquet of the export.
+    """
     from onedemo.app.dataset.importer import import_data
 
-    there = import_data(arguments.ratings, arguments.segments, arguments.data_dir)
+    there = import_data(ratings, segments, data_dir)
     print("  ".join(f"{count} {what}" for what, count in there.items()))
 
 
-def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
-    """The database in ``--data-dir``, closed with the block.
+def open_store(data_dir: Path, must_exist: bool = False) -> Any:
+    """The database of a data directory, closed with the block.
 
     Raises:
         UserError: If there must be one and is none, or it cannot be opened.
@@ -98,6 +92,6 @@ def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
 
     from onedemo.storage.store import FILE_NAME, Store
 
-    if must_exist and not (arguments.data_dir / FILE_NAME).exists():
-        raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")
-    return closing(Store(arguments.data_dir))
+    if must_exist and not (data_dir / FILE_NAME).exists():
+        raise UserError(f"no {FILE_NAME} in {data_dir}; give the directory with --data-dir")
+    return closing(Store(data_dir))

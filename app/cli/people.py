@@ -2,71 +2,61 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from onedemo.app.cli.data import add_data_dir, check_output, open_store
+from cyclopts import App
+
+from onedemo.app.cli.data import DATA, DataDir, check_output, open_store
 from onedemo.errors import UserError
 
 COMMAND_LINE = "command line"
 """Who did what is done here, as the audit log has it."""
 
+rater = App(name="rater", help="People and their links.")
 
-def add_people_commands(commands: Any, command: Callable[..., argparse.ArgumentParser]) -> None:
-    """Adds them to the command line.
+
+@rater.command
+def add(
+    name: str, /, *, researcher: bool = False, url: str = "http://127.0.0.1:8080", once: bool = False,
+    expires: str | None = None, data_dir: DataDir = DATA,
+) -> None:  # fmt: skip
+    """A new rater, or another link of one; prints the link to send.
 
     Args:
-        commands: Where sub-commands are added.
-        command: Adds one: (commands, name, function, summary).
+        name: What to call them.
+        researcher: May watch, steer and export too.
+        url: Address people reach the page at.
+        once: A link that opens once.
+        expires: A link that ends after a time: 30m, 12h, 7d.
     """
-    rater = command(commands, "rater", None, "people and their links")
-    actions = rater.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=type(rater))
-    new = command(actions, "add", _add, "a new rater, or another link of one; prints the link to send")
-    new.add_argument("name")
-    new.add_argument("--researcher", action="store_true", help="may watch, steer and export too")
-    new.add_argument("--url", default="http://127.0.0.1:8080", help="address people reach the page at")
-    new.add_argument("--once", action="store_true", help="a link that opens once")
-    new.add_argument("--expires", metavar="TIME", help="a link that ends after a time: 30m, 12h, 7d")
-    people = command(actions, "list", _list, "everybody")
-    links = command(
-        actions, "links", _links, "all links and what has become of them, not the links themselves"
-    )
-    revoke = command(actions, "revoke", _revoke, "end a rater's links and open pages; ratings stay")
-    revoke.add_argument("name", nargs="?")
-    revoke.add_argument("--link", type=int, metavar="N", help="only this link, by its number")
-    audit = command(commands, "audit", _audit, "who came in, took data out or changed a run")
-    audit.add_argument("--csv", type=Path, metavar="FILE", help="write it there, as CSV")
-    for parser in (new, people, links, revoke, audit):
-        add_data_dir(parser)
-
-
-def _add(arguments: argparse.Namespace) -> None:
     from onedemo.app.http.tokens import issue_link, passing_link, read_secret, read_span
     from onedemo.core.names import check_person
 
-    name = check_person(arguments.name)
-    lasts = read_span(arguments.expires) if arguments.expires is not None else None
-    with open_store(arguments) as store:
-        rater = store.ensure_rater(name, "researcher" if arguments.researcher else "annotator")
-        if arguments.once or lasts is not None:
-            link = passing_link(store, rater, arguments.url, once=arguments.once, lasts=lasts)
+    name = check_person(name)
+    lasts = read_span(expires) if expires is not None else None
+    with open_store(data_dir) as store:
+        person = store.ensure_rater(name, "researcher" if researcher else "annotator")
+        if once or lasts is not None:
+            url = passing_link(store, person, url, once=once, lasts=lasts)
         else:
-            link = issue_link(store, read_secret(arguments.data_dir), rater, arguments.url)
-        kind = ("once" if arguments.once else "standing") + (f", {arguments.expires}" if lasts else "")
-        store.add_audit(COMMAND_LINE, "made a link", f"for {rater.name}, {rater.role} ({kind})")
-        print(link)
+            url = issue_link(store, read_secret(data_dir), person, url)
+        kind = ("once" if once else "standing") + (f", {expires}" if lasts else "")
+        store.add_audit(COMMAND_LINE, "made a link", f"for {person.name}, {person.role} ({kind})")
+        print(url)
 
 
-def _list(arguments: argparse.Namespace) -> None:
-    with open_store(arguments, must_exist=True) as store:
-        for rater in store.raters():
-            print(f"{rater.name:24} {rater.role}")
+@rater.command(name="list")
+def list_(*, data_dir: DataDir = DATA) -> None:
+    """Everybody."""
+    with open_store(data_dir, must_exist=True) as store:
+        for person in store.raters():
+            print(f"{person.name:24} {person.role}")
 
 
-def _links(arguments: argparse.Namespace) -> None:
-    with open_store(arguments, must_exist=True) as store:
+@rater.command
+def links(*, data_dir: DataDir = DATA) -> None:
+    """All links and what has become of them, not the links themselves."""
+    with open_store(data_dir, must_exist=True) as store:
         heads = ("link", "rater", "role", "state", "once", "made", "expires", "last used")
         rows = [
             (str(link.id), link.rater.name, link.rater.role, link.state, "once" if link.once else "-",
@@ -79,32 +69,45 @@ def _links(arguments: argparse.Namespace) -> None:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def _revoke(arguments: argparse.Namespace) -> None:
-    if (arguments.name is None) == (arguments.link is None):
+@rater.command
+def revoke(name: str | None = None, /, *, link: int | None = None, data_dir: DataDir = DATA) -> None:
+    """End a rater's links and open pages; ratings stay.
+
+    Args:
+        name: The rater.
+        link: Only this link, by its number.
+    """
+    if (name is None) == (link is None):
         raise UserError("name the rater whose links are to end, or one link with --link N")
-    with open_store(arguments, must_exist=True) as store:
-        if arguments.link is not None:
-            link = store.revoke_link(arguments.link)
-            store.add_audit(COMMAND_LINE, "revoked a link", f"{link.id} of {link.rater.name}")
-            print(f"ended link {link.id} of {link.rater.name} and the pages opened with it; the ratings stay")
+    with open_store(data_dir, must_exist=True) as store:
+        if link is not None:
+            ended = store.revoke_link(link)
+            store.add_audit(COMMAND_LINE, "revoked a link", f"{ended.id} of {ended.rater.name}")
+            whose = f"link {ended.id} of {ended.rater.name}"
+            print(f"ended {whose} and the pages opened with it; the ratings stay")
             return
-        raters = {rater.name: rater for rater in store.raters()}
-        if arguments.name not in raters:
-            raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
-        ended = store.revoke_tokens(raters[arguments.name].id)
-        store.add_audit(COMMAND_LINE, "revoked a rater", arguments.name)
-        print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
+        raters = {person.name: person for person in store.raters()}
+        if name not in raters:
+            raise UserError(f"no rater {name!r}; there are: {', '.join(raters) or 'none'}")
+        count = store.revoke_tokens(raters[name].id)
+        store.add_audit(COMMAND_LINE, "revoked a rater", name)
+        print(f"ended {count} links and sessions of {name}; the ratings stay")
 
 
-def _audit(arguments: argparse.Namespace) -> None:
+def audit(*, csv: Path | None = None, data_dir: DataDir = DATA) -> None:
+    """Who signed in, took data out or changed a run.
+
+    Args:
+        csv: Write it there, as CSV.
+    """
     from onedemo.app.dataset.ratings_csv import csv_blocks
     from onedemo.core.files import write_atomic
     from onedemo.storage.audit_log import AUDIT_COLUMNS
 
-    with open_store(arguments, must_exist=True) as store:
-        if arguments.csv is not None:
-            check_output(arguments.csv, arguments.data_dir)
-            write_atomic(arguments.csv, csv_blocks(store.audit(), AUDIT_COLUMNS))
+    with open_store(data_dir, must_exist=True) as store:
+        if csv is not None:
+            check_output(csv, data_dir)
+            write_atomic(csv, csv_blocks(store.audit(), AUDIT_COLUMNS))
             return
         for at, who, what, detail in store.audit():
             print(f"{at[:19].replace('T', ' ')}  {who:24} {what}{': ' if detail else ''}{detail}")

@@ -174,3 +174,24 @@ def test_another_run_has_the_settings_of_the_one_at_hand(method):
 def test_a_setting_of_a_section_leaves_the_others_as_they_were():
     """The sections' own defaults are not always those of a run."""
     assert load_config(None, {"policy.log_std": -0.5}).policy.kind == load_config().policy.kind == "table"
+
+
+def test_an_error_says_which_file_it_is_in(tmp_path):
+    file = tmp_path / "c.toml"
+    for text, said in (
+        ("[trpo]\nmax_kll = 1", "unknown key 'trpo.max_kll'; the nearest valid one is 'trpo.max_kl'"),
+        ("[trpo]\nmax_kl = 'x'", "trpo.max_kl must be a number, got 'x'"),
+        ("[trpo]\nmax_kl = -1", "trpo.max_kl must be > 0 nats, got -1.0"),
+    ):
+        file.write_text(text)
+        with pytest.raises(UserError) as caught:
+            load_config(file)
+        assert str(caught.value) == f"{file}: {said}"
+    with pytest.raises(UserError, match=r"^trpo\.max_kl must be"):  # what was typed is not the file's fault
+        load_config(file, {"trpo.max_kl": -2})
+
+
+def test_an_empty_section_changes_nothing(tmp_path):
+    file = tmp_path / "c.toml"
+    file.write_text("[policy]\n")
+    assert load_config(file) == load_config()

@@ -10,19 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from onedemo.queries.settings import CHOICES
 from onedemo.types import Rollouts
 
 Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(lanes, starts, demo_steps), (n,) each, to predicted ratings and the disagreement on them, (n,) each."""
 
 _CANDIDATES = 3000
-CHOICES: dict[str, dict[str, float]] = {
-    "uniform": {"any": 1.0},
-    "mix": {"high": 0.4, "disagreement": 0.3, "any": 0.3},
-    "high": {"high": 1.0},
-    "disagreement": {"disagreement": 1.0},
-}
-"""Ways to choose a round: the shares of clips rated highest, of those most disagreed on, and of any."""
 _APART = 15
 """Control steps of the demo within which ..."""
 _MOST_THERE = 2

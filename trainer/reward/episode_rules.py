@@ -28,6 +28,7 @@ import numpy as np
 import torch
 
 from onedemo.reward.model import CLASSES, Snapshot
+from onedemo.reward.settings import PracticeConfig
 from onedemo.rl.rollouts import EpisodeRules, Starts, Step, Transitions
 from onedemo.types import Rollouts
 
@@ -46,29 +47,6 @@ _BUFFER_TRIES = 8000
 """Random states compared with each of them."""
 _BUFFER_KEPT = 12
 """Of these, the ones most like it are kept."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PracticeConfig:
-    """Which rules hold, and how far they go."""
-
-    elastic: bool = True
-    """The demo phase adapts to the robot; False: it runs in real time."""
-    slack_seconds: float = 0.6
-    """How far the adaptive phase may be from real time, either way."""
-    bank_share: float = 0.5
-    """Share of episodes that start in a random state that the predictor likes; 0: all stand."""
-    give_up: float = 0.3
-    """An episode ends when the running similarity falls below this share of that of the reset buffer's
-    states, the most that the predictor gives; 0: never."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.bank_share <= 1:
-            raise ValueError(f"practice.bank_share must be in 0..1, got {self.bank_share}")
-        if not 0 <= self.give_up < 1:
-            raise ValueError(f"practice.give_up must be in 0..1, got {self.give_up}")
-        if self.slack_seconds < 0:
-            raise ValueError(f"practice.slack_seconds must be at least 0, got {self.slack_seconds}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -22,66 +22,13 @@ import torch
 
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
+from onedemo.reward.settings import KINDS, PredictorConfig
 from onedemo.storage.store import RatedSegment
 from onedemo.vision.pose_estimator import Track
 
 CLASSES = 5
-KINDS = {"network": "onedemo.reward.two_branch_net", "metric": "onedemo.reward.learned_distance"}
-"""Kind to module; each has ``fit(...)`` as below and ``restore(data, config, device)``."""
 _FAR = 5.0
 """Standard deviations beyond which a visual input of another demo is no farther."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PredictorConfig:
-    """What is fitted to the ratings, and how."""
-
-    kind: str = "metric"
-    """"network": the paper's; "metric": a distance between poses, with a weight for each part."""
-    appearance: bool = True
-    """Learn from own pictures what the robot looks like, and see poses in the demo's frames. Without it,
-    or where the demo shows another body, the ratings alone say what a frame is like."""
-    members: int = 3
-    """Predictors fitted side by side on different draws of the ratings: where they disagree, ask."""
-    sampling: str = "equal"
-    """"equal": as many pairs of each rating in a batch; "random": as they come. Of "network"."""
-    class_weights: bool = False
-    """Weigh the loss of rare ratings more (the paper's third and fourth variant). Of "network"."""
-    additional_layer: bool = True
-    """One more fully connected layer before the softmax (the paper's last variant). Of "network"."""
-    ordinal: bool = False
-    """Ratings next to the one given count as half right. Of "network"; "metric" always knows the order."""
-    hidden: int = 64
-    """Width of every layer. Of "network"."""
-    visual_dims: int = 24
-    """Principal components of the demo's frame features that enter; 0: all features, as in the paper."""
-    learning_rate: float = 0.03
-    """Of stochastic gradient descent with momentum 0.9. Of "network"."""
-    weight_decay: float = 1e-4
-    """L2 penalty. Of "network"."""
-    batch_clips: int = 60
-    """Clips in a batch. Of "network"."""
-    pairs_per_clip: int = 4
-    """(frame, state-action) pairs drawn from each of them. Of "network"."""
-    updates: int = 1500
-    """Gradient steps of one fit. Of "network"."""
-    reward: str = "expected"
-    """"expected" rating, 1..5 in between; or "argmax", the most probable class."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"predictor.kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
-        if self.sampling not in ("equal", "random"):
-            raise ValueError(f'predictor.sampling must be "equal" or "random", got {self.sampling!r}')
-        if self.reward not in ("expected", "argmax"):
-            raise ValueError(f'predictor.reward must be "expected" or "argmax", got {self.reward!r}')
-        for name in ("members", "hidden", "batch_clips", "pairs_per_clip", "updates"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"predictor.{name} must be at least 1, got {getattr(self, name)}")
-        if self.visual_dims < 0:
-            raise ValueError(f"predictor.visual_dims must be 0 or more, got {self.visual_dims}")
-        if self.learning_rate <= 0:
-            raise ValueError(f"predictor.learning_rate must be > 0, got {self.learning_rate}")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

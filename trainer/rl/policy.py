@@ -22,37 +22,16 @@ from torch import nn
 
 from onedemo.errors import UserError
 from onedemo.rl.policy_inputs import (
-    KINDS,
     feature_size,
     policy_inputs,
     rows_of,
     state_features,
     time_features,
 )
+from onedemo.rl.settings import PolicyConfig
 
 _CLIP = 10.0
 """Normalised inputs are clipped to +- this many standard deviations."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class PolicyConfig:
-    """What the policy sees and how large it is."""
-
-    kind: str = "clock"
-    """"clock": pose, velocities and the demo clock as harmonics; "table": pose, velocities and
-    what a table holds for the demo step (say, frame features); "pose": no time; "raw": the
-    observation alone."""
-    hidden: tuple[int, ...] = (64, 64)
-    """Widths of the tanh layers, of the policy and of the value function (2 x 64: the
-    network of the human-preferences literature)."""
-    log_std: float = 0.0
-    """Initial log standard deviation of each action; actions reach from -1 to 1."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"policy.kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise ValueError(f"policy.hidden must be positive layer widths, got {self.hidden}")
 
 
 @dataclass(frozen=True, slots=True)

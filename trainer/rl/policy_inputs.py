@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-KINDS = ("clock", "table", "pose", "raw")
+from onedemo.rl.settings import KINDS
+
 HARMONICS = (1, 2, 4, 8, 16)
 
 

@@ -1,5 +1,6 @@
 import csv
 import json
+import re
 import shutil
 import socket
 import sqlite3
@@ -8,9 +9,10 @@ import sys
 
 import pytest
 
+from helpers.paths import ROOT
 from helpers.server_process import Serving
-from onedemo.app.cli.main import _parser, main
-from onedemo.config import METHODS
+from onedemo.app.cli.main import _app, main
+from onedemo.config import METHODS, RunConfig, describe, to_toml
 from onedemo.storage.schema import STEPS as SCHEMA
 from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, Store
 
@@ -107,10 +109,34 @@ def test_help_is_quick_and_loads_nothing_heavy():
     assert out.rstrip().endswith("[]")
 
 
+@pytest.mark.parametrize("command", ["serve", "train"])
+def test_the_help_shows_every_setting_with_its_default_and_meaning(command, capsys):
+    assert main([command, "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    settings = list(describe())
+    assert len(settings) == to_toml(RunConfig()).count(" = ") > 50
+    for key, default, meaning in settings:
+        assert f" {key} = {default} {meaning}" in shown
+        assert len(meaning) > 5
+
+
+def test_the_table_of_the_docs_is_of_settings_that_there_are():
+    table = (ROOT / "docs" / "options.md").read_text().split("## Settings")[1].split("## Limits")[0]
+    named = set(re.findall(r"`([a-z_]+[.][a-z_]+)`", table))
+    assert named and named <= {key for key, _, _ in describe()}
+
+
+@pytest.mark.parametrize("words", [[], ["demo"], ["rater"], ["bench"], ["baseline"]])
+def test_a_command_that_is_missing(words, capsys):
+    assert main(words) == 2
+    assert "a command is missing" in capsys.readouterr().err
+
+
 def test_every_method_can_be_asked_for():
     for method in METHODS:
         for command in ("serve", "train"):
-            assert _parser().parse_args([command, "--method", method]).method == method
+            _, bound, _ = _app().parse_args([command, "--method", method], exit_on_error=False)
+            assert bound.arguments["options"].overrides() == {"method": method}
 
 
 @pytest.mark.seam
