@@ -109,7 +109,7 @@ class Trainer:
         if renderer is not None:
             self._gallery = best_rollouts.Gallery(self.files.rollouts, demo, self.dt, renderer)
         self._asking = Asking(store, run, config, simulated)
-        self._training_set = TrainingSet(store, run, self.dt)
+        self._training_set = TrainingSet(store, run)
         self._pool: Rollouts | None = None
         self._policy: PolicySnapshot | None = None
         self._stop, self._pause = threading.Event(), threading.Event()
