@@ -1,12 +1,11 @@
-// Keys and buttons of the page. Viser carries every press: a button presses its key, and the key is
-// bound on the server to the clip on screen. What this file adds is what only the browser can know:
-// whether a key is being held, whether the clip's picture is there yet, which colours are preferred;
-// and what concerns nobody else, such as slow motion (static/player.js).
+// Keys and buttons of the page. An answer is one request, which names what was on screen when it was
+// pressed; what comes next the server draws by Viser. What concerns nobody else, such as slow motion,
+// is done here (static/player.js). Keys with Alt, such as those of the tabs, are Viser's.
 //
 // Not a module: it must have run before Viser, which begins while the page is still being read.
 (() => {
   "use strict";
-  const { main, toggleSlow, watchPlayers } = clips; // static/player.js
+  const { forget, main, toggleSlow, watchPlayers } = clips; // static/player.js
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
@@ -22,13 +21,12 @@
     return target instanceof Element && target.closest("input, textarea, select, [contenteditable=true]");
   }
 
-  function press(combination) {
-    const parts = combination.split("+");
-    const key = parts.pop();
+  // A key that Viser listens to, such as "alt+2".
+  function viserKey(combination) {
+    const key = combination.at(-1);
     const code = /^[0-9]$/.test(key) ? `Digit${key}` : `Key${key.toUpperCase()}`;
-    const alt = parts.includes("alt");
     document.documentElement.dispatchEvent(
-      new KeyboardEvent("keydown", { key, code, altKey: alt, bubbles: true, cancelable: true }),
+      new KeyboardEvent("keydown", { key, code, altKey: true, bubbles: true, cancelable: true }),
     );
   }
 
@@ -39,40 +37,93 @@
     setTimeout(() => button.classList.remove("od-pressed"), 180);
   }
 
-  // What is said of a clip besides its rating goes another way than presses, and must be there first.
-  let noting = null;
-  async function post(where, what) {
+  async function post(where, what, options = {}) {
     const answer = await fetch(`${location.pathname}/${where}`, {
       method: "POST",
       headers: { "Content-Type": "application/json" },
       body: JSON.stringify(what),
+      ...options,
     });
+    if (answer.status === 401) throw new Error("This page is closed. Please open your link again.");
     if (!answer.ok) throw new Error(await answer.text());
+    return answer;
   }
-  const note = (what) => post("note", what);
 
-  function noteMark(player) {
-    if (!player.clip) return;
-    const mine = note({ clip: player.clip, mark: player.mark })
-      .then(
-        () => (player.unsent = false),
-        (error) => {
-          // It stays on screen: the next press tries it again, and rates only once it is kept.
-          player.unsent = true;
-          player.say(`Your mark could not be saved (${error.message}). Rate again to try once more, or clear it.`);
-        },
-      )
-      .finally(() => {
-        if (noting === mine) noting = null;
-      });
-    noting = mine;
+  // Why the last answer did not count; it stays until the next one.
+  function say(text) {
+    shown("body > .od-problem")?.remove();
+    if (!text) return;
+    const note = document.createElement("p");
+    note.className = "od-problem";
+    note.setAttribute("role", "alert");
+    note.textContent = text;
+    document.body.append(note);
+  }
+
+  // Answers go one after another. A request that gets no answer is sent once more, under the same number,
+  // by which the server knows it.
+  let line = Promise.resolve();
+  function send(press) {
+    const id = [...crypto.getRandomValues(new Uint32Array(4))].join("-");
+    const body = { page: shown(".od-header").dataset.page, id, ...press };
+    line = line.then(() => deliver(body)).then(
+      (counted) => (say(""), counted),
+      (error) => (say(error.message), false),
+    );
+    return line;
+  }
+
+  async function deliver(body, tries = 2) {
+    try {
+      return (await (await post("press", body, { signal: AbortSignal.timeout(8000) })).json()).counted;
+    } catch (error) {
+      if (!["TypeError", "TimeoutError"].includes(error.name)) throw error; // it was answered
+      if (tries === 1)
+        throw new Error("There is no connection: that was not saved. Nothing else is lost: please press again.");
+    }
+    await new Promise((go) => setTimeout(go, 500));
+    return deliver(body, tries - 1);
+  }
+
+  const PAIR = { 1: "left", 2: "equal", 3: "right", s: "skip" };
+  const PRACTICE = { g: "next", s: "leave" };
+
+  // What "1" to "5", "s" or "g" say of what is on screen, if they say anything.
+  function meant(key, { clip, pair, exercise }, mark) {
+    if (exercise) return { press: "practise", exercise: Number(exercise), do: PRACTICE[key] ?? Number(key) };
+    if (pair) return PAIR[key] && { press: "compare", pair: Number(pair), answer: PAIR[key] };
+    if (key === "s") return { press: "skip", clip: Number(clip) };
+    return key !== "g" && { press: "rate", clip: Number(clip), value: Number(key), mark };
+  }
+
+  function answer(key) {
+    const player = main();
+    // Nobody has seen it yet, or it was answered a moment ago and is about to go.
+    if (!player?.ready || player.answered) return;
+    const { dataset } = player.element;
+    const press = meant(key, dataset, player.mark);
+    if (!press) return;
+    flash(key);
+    player.answered = !dataset.exercise;
+    send(press).then((counted) => {
+      if (counted) forget(player.clip);
+      else player.answered = false;
+    });
+  }
+
+  // Takes back what was answered a moment ago, or what the button says.
+  function undo() {
+    const player = main();
+    const button = shown("[data-undo-clip], [data-undo-pair]");
+    const { clip, pair } = player?.answered ? player.element.dataset : {};
+    const { undoClip = clip, undoPair = pair } = clip || pair ? {} : (button?.dataset ?? {});
+    if (player) player.answered = false;
+    if (undoPair) send({ press: "compare", pair: Number(undoPair), answer: "undo" });
+    else if (undoClip) send({ press: "undo", clip: Number(undoClip) });
   }
 
   function sayWhy(box, reason) {
-    note({ clip: Number(box.dataset.clip), reason }).then(
-      () => (box.textContent = "Noted. Thank you."), // as the server is about to say
-      (error) => (box.textContent = error.message),
-    );
+    send({ press: "reason", clip: Number(box.dataset.clip), reason });
   }
 
   // Keys that concern this browser alone. True if the key was one of them.
@@ -84,10 +135,8 @@
     else if (key === "f" || key === "F") toggleSlow();
     else if (key === "ArrowLeft") player.seek(player.frame - 1);
     else if (key === "ArrowRight") player.seek(player.frame + 1);
-    else if ((key === "m" || key === "M") && player.clip) {
-      player.markByKey();
-      if (player.marking === null) noteMark(player);
-    } else return false;
+    else if ((key === "m" || key === "M") && player.clip) player.markByKey();
+    else return false;
     return true;
   }
 
@@ -109,28 +158,17 @@
         if (!["Escape", "Enter", "Tab"].includes(event.key)) stop();
         return;
       }
-      if (/^Numpad[1-5]$/.test(event.code) && /^[1-5]$/.test(event.key)) {
-        // Viser's keys are those above the letters.
-        stop();
-        if (!event.repeat) press(event.key);
-        return;
-      }
       const arrows = event.key.startsWith("Arrow");
       if (arrows && event.target.closest?.("[role=slider], [role=tablist]")) return;
-      const rating = /^[1-5sS]$/.test(event.key) && !event.altKey;
-      const ours = rating || event.key === "u" || event.key === "U" || event.key === "Backspace";
-      if (ours && (event.repeat || (rating && !main()?.ready))) return stop(); // no rating of what is not there yet
-      const player = main();
-      if (/^[1-5]$/.test(event.key) && rating && player && (noting || player.unsent)) {
+      const key = event.key === "Backspace" ? "u" : event.key.toLowerCase();
+      if (/^[1-5su]$/.test(key) && !event.altKey) {
         stop();
-        if (!noting) noteMark(player);
-        noting.then(() => main() === player && !player.unsent && press(event.key));
+        if (!event.repeat) key === "u" ? undo() : answer(key);
         return;
       }
-      if (rating) flash(event.key.toLowerCase());
       if (event.key === "Enter" && shown("[data-go]") && !event.target.closest?.("button, a")) {
         stop();
-        if (!event.repeat) press("g");
+        if (!event.repeat) answer("g");
         return;
       }
       // On a button too: the space bar always replays. Enter presses a button.
@@ -150,16 +188,16 @@
     const button = event.target instanceof Element ? event.target.closest("button") : null;
     if (!button || button.disabled) return;
     const data = button.dataset;
-    if (data.key) press(data.key);
+    if (data.key?.startsWith("alt+")) viserKey(data.key);
+    else if (data.key === "u") undo();
+    else if (data.key) answer(data.key);
     else if ("replay" in data) local(" ");
     else if ("slow" in data) local("f");
     else if ("step" in data) local(data.step === "1" ? "ArrowRight" : "ArrowLeft");
     else if ("mark" in data) local("m");
     else if ("help" in data) local("?");
-    else if ("unmark" in data) {
-      main()?.setMark(null);
-      if (main()) noteMark(main());
-    } else if (data.video) {
+    else if ("unmark" in data) main()?.setMark(null);
+    else if (data.video) {
       const film = shown(".od-film");
       const video = film.querySelector("video");
       video.src = data.video;
@@ -179,7 +217,7 @@
     else if ("submit" in data) {
       // What is on screen is what is rated: slider messages are throttled and may come too late.
       const thumb = shown(".mantine-Slider-thumb");
-      if (thumb) press(thumb.getAttribute("aria-valuenow"));
+      if (thumb) answer(thumb.getAttribute("aria-valuenow"));
     }
   });
 
@@ -220,7 +258,6 @@
       removeEventListener("pointermove", move);
       removeEventListener("pointerup", up);
       removeEventListener("pointercancel", up);
-      if (dragged) noteMark(player);
     };
     player.seek(Math.floor(start));
     addEventListener("pointermove", move);

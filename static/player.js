@@ -13,6 +13,7 @@ const clips = (() => {
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const pictures = new Map();
   const players = new Map();
+  const marks = new Map(); // of clips that are not answered yet: another tab takes them off the page
   let slow = false;
 
   // A bitmap stays decoded; an element's picture may have to be decoded again when it is drawn.
@@ -56,11 +57,13 @@ const clips = (() => {
       this.playing = !still.matches;
       this.once = false;
       this.mark = null; // [first frame, frame after the last]
-      this.unsent = false; // whether the server does not know of it
       this.marking = null; // frame at which a mark by key began
+      this.answered = false;
       this.drawn = -1;
       picture(this.source);
-      if (element.dataset.mark) this.setMark(element.dataset.mark.split(",").map(Number));
+      const before = element.dataset.mark?.split(",").map(Number); // as it was when it was taken back
+      const mark = marks.has(this.clip) ? marks.get(this.clip) : before;
+      if (mark) this.setMark(mark);
       this.draw();
     }
 
@@ -155,6 +158,7 @@ const clips = (() => {
     setMark(mark) {
       this.mark = mark;
       this.marking = null;
+      marks.set(this.clip, mark);
       this.drawBar();
       if (!mark) return this.say("Drag where it goes wrong, if you like");
       const [from, to] = mark.map((frame) => (frame / this.fps).toFixed(2));
@@ -224,5 +228,10 @@ const clips = (() => {
     look();
   }
 
-  return { main, toggleSlow, watchPlayers };
+  // A clip was answered, with its mark.
+  function forget(clip) {
+    marks.delete(Number(clip));
+  }
+
+  return { forget, main, toggleSlow, watchPlayers };
 })();

@@ -29,10 +29,6 @@ class Ask:
     clip: int
     kind: str = "fresh"
     """"fresh", or asked again: "shared" (others have rated it), "repeated" (the same person has)."""
-    mark: tuple[int, int] | None = None
-    """Once it is answered: where it was said to go wrong, first picture and picture after the last."""
-    value: int | None = None
-    """Once it is answered: the rating; None if it was skipped."""
 
     @property
     def repeat(self) -> bool:

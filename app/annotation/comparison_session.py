@@ -11,6 +11,7 @@ from collections.abc import Callable, Hashable
 
 from onedemo.app.annotation.assignment import Assignment, Seat
 from onedemo.app.annotation.rating_session import GUARD_SECONDS, AnsweredElsewhere
+from onedemo.storage.ratings import AlreadyAnswered
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 
@@ -24,18 +25,18 @@ class PairDesk:
         rater: Who compares.
         assignment: Shared by all pages of the run; of pairs alone.
         holder: Names this page to the assignment.
+        guard_seconds: A press that comes sooner after the pair was not made for it.
         clock: Seconds; replaced in tests.
     """
 
     def __init__(
-        self, store: Store, run: str, rater: Rater, assignment: Assignment, holder: Hashable,
-        clock: Callable[[], float] = time.monotonic,
+        self, store: Store, run: str, rater: Rater, assignment: Assignment, holder: Hashable, *,
+        guard_seconds: float = GUARD_SECONDS, clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         self._store, self._run, self._rater = store, run, rater
-        self._assignment, self._clock = assignment, clock
+        self._assignment, self._guard_seconds, self._clock = assignment, guard_seconds, clock
         self._holder = Seat(rater.id, holder)
         self._lock = threading.RLock()
-        self._done: list[int] = []
         self._shown_at = 0.0
         self.current: int | None = None
         """The pair on screen, None while there is none."""
@@ -43,9 +44,9 @@ class PairDesk:
         """The pair after it, to be fetched ahead."""
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is an answer of this page to take back."""
-        return bool(self._done)
+    def undoable(self) -> int | None:
+        """The pair whose answer may be taken back: the last one of this rater, at whatever page."""
+        return self._store.last_compared(self._run, self._rater.id)
 
     def refill(self) -> bool:
         """Looks for pairs if none is on screen or at hand; returns whether anything changed."""
@@ -69,31 +70,30 @@ class PairDesk:
         """
         with self._lock:
             seconds = self._clock() - self._shown_at
-            if pair != self.current or seconds < GUARD_SECONDS:
+            if pair != self.current or seconds < self._guard_seconds:
                 return False
-            if self._store.compared(pair, self._rater.id):
+            try:
+                self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
+            except AlreadyAnswered:
                 self._assignment.release(self._holder, pair)
                 self._advance()
                 raise AnsweredElsewhere(
                     "You had compared that pair at another page of yours: that answer stands."
-                )
-            self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
-            self._done.append(pair)
+                ) from None
             self._assignment.release(self._holder, pair)
             self._advance()
             return True
 
-    def undo(self) -> bool:
-        """Takes the last answer back and shows its pair again; False if there is none.
+    def undo(self, pair: int) -> bool:
+        """Takes this rater's last answer back and shows its pair again; False if that is of another pair.
 
         Raises:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            if not self._done:
+            if pair != self._store.last_compared(self._run, self._rater.id):
                 return False
-            self._store.compare(self._done[-1], self._rater.id, "undo", 0)
-            pair = self._done.pop()
+            self._store.compare(pair, self._rater.id, "undo", 0)
             if self.upcoming is not None and self.current is not None:
                 self._assignment.release(self._holder, self.upcoming)
             self.upcoming = self.current or self.upcoming

@@ -1,8 +1,8 @@
 """What happens when somebody rates: the rules of the Rate tab, without any page.
 
 Every press names the clip that was on screen. A press that names another clip, or comes sooner
-after the clip than anybody can judge (a held key), changes nothing. A rating is committed before the
-desk moves on; if the commit fails the clip stays.
+after the clip than anybody can judge (a held key), changes nothing. A rating is committed with its mark
+before the desk moves on; if the commit fails the clip stays. What may be taken back, the events tell.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import random
 import threading
 import time
 from collections.abc import Callable, Hashable
-from dataclasses import replace
+
+import numpy as np
 
 from onedemo.app.annotation.assignment import Ask, Assignment, Seat, to_repeat, to_share
-from onedemo.reward.segment_marks import seconds_of_pictures
+from onedemo.reward.segment_marks import Mark, picture_of_step, pictures_of_steps, steps_of_pictures
+from onedemo.storage.ratings import AlreadyAnswered, LastAnswer
 from onedemo.storage.store import Store
-from onedemo.types import Rater
+from onedemo.types import Demo, Rater
 
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
@@ -24,10 +26,6 @@ GUARD_SECONDS = 0.3
 
 class AnsweredElsewhere(Exception):
     """What was pressed at a page is answered already, by the same person at another page."""
-
-
-Mark = tuple[float, float]
-"""Where a clip goes wrong: its first picture, and the picture after the last; whole numbers."""
 
 
 class Desk:
@@ -40,9 +38,8 @@ class Desk:
         assignment: Shared by all pages of the run.
         holder: Names this page to the assignment.
         dt: Seconds of a control step.
-        fps: Pictures per second of the demo.
-        frames: Pictures of the demo.
-        done: What was rated or skipped here before, to be taken back: a page that is loaded again goes on.
+        demo: What is beside the clips.
+        guard_seconds: A press that comes sooner after the clip was not made for it.
         clock: Seconds; replaced in tests.
         rng: Draws which clips are asked again.
     """
@@ -56,9 +53,8 @@ class Desk:
         holder: Hashable,
         *,
         dt: float,
-        fps: float,
-        frames: int,
-        done: list[Ask] | None = None,
+        demo: Demo,
+        guard_seconds: float = GUARD_SECONDS,
         clock: Callable[[], float] = time.monotonic,
         rng: random.Random | None = None,
     ) -> None:
@@ -67,22 +63,19 @@ class Desk:
         self.rater = rater
         self._assignment = assignment
         self._holder = Seat(rater.id, holder)
-        self._dt, self._fps, self._frames = dt, fps, frames
+        self._dt, self._demo = dt, demo
+        self._guard_seconds = guard_seconds
         self._clock = clock
         self._rng = rng or random.Random()
         self._lock = threading.RLock()
-        self._done = done if done is not None else []
         self._shown_at = 0.0
         self._kind = self._assignment.again.draw(self._rng)
         self._current: Ask | None = None
         self._upcoming: Ask | None = None
-        self.mark: tuple[int, int] | None = None
-        """Where the clip on screen goes wrong, as far as said."""
-        self.skipped: int | None = None
-        """The clip that was skipped last, as long as its reason may still be said."""
+        self._skipped: Ask | None = None
         self.explained = False
-        """Whether its reason was said, until the next press."""
-        self.taken_back: Ask | None = None
+        """Whether the reason of the last skip was said, until the next press."""
+        self.taken_back: LastAnswer | None = None
         """What was answered to the clip on screen before it was taken back."""
 
     @property
@@ -96,9 +89,21 @@ class Desk:
         return self._upcoming.clip if self._upcoming else None
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is a rating or a skip to take back."""
-        return bool(self._done)
+    def skipped(self) -> int | None:
+        """The clip that was skipped last, as long as its reason may still be said."""
+        return self._skipped.clip if self._skipped else None
+
+    @property
+    def undoable(self) -> int | None:
+        """The clip whose rating or skip may be taken back: the last one of this rater, at whatever page."""
+        last = self._store.last_answer(self._run, self.rater.id)
+        return last.clip if last else None
+
+    @property
+    def mark(self) -> Mark | None:
+        """What was marked on the clip on screen before it was taken back, in pictures."""
+        last = self.taken_back
+        return pictures_of_steps(last.mark, self._pictures(last.clip)) if last and last.mark else None
 
     def refill(self) -> bool:
         """Looks for clips if none is on screen or none is at hand; returns whether anything changed."""
@@ -110,35 +115,40 @@ class Desk:
                 self._upcoming = self._pick(self._waiting())
             return before != (self._current, self._upcoming)
 
-    def rate(self, clip: int, value: int) -> bool:
+    def rate(self, clip: int, value: int, mark: Mark | None = None) -> bool:
         """Commits a rating of the clip that was on screen and moves on.
+
+        Args:
+            clip: What was on screen.
+            value: 1 to 5.
+            mark: Where it goes wrong: its first picture, and the picture after the last.
 
         Returns:
             False if the press counts for nothing.
 
         Raises:
             AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
+            ValueError: If the mark is no stretch of the clip.
             sqlite3.Error: If it could not be committed; the clip stays.
         """
-        with self._lock:
-            ask = self._accepted(clip)
-            if ask is None:
-                return False
-            seconds = self._seconds(clip, self.mark) if self.mark is not None else None
-            self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=seconds, repeat=ask.repeat)
-            self._leave(replace(ask, mark=self.mark, value=value))
-            return True
+
+        def commit(ask: Ask) -> None:
+            steps = steps_of_pictures(mark, self._pictures(clip)) if mark is not None else None
+            self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=steps, repeat=ask.repeat)
+
+        return self._answer(clip, commit) is not None
 
     def skip(self, clip: int) -> bool:
         """As ``rate``, but without a rating. ``explain`` may follow."""
-        with self._lock:
-            ask = self._accepted(clip)
-            if ask is None:
-                return False
+
+        def commit(ask: Ask) -> None:
             self._store.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
-            self._leave(ask)
-            self.skipped = clip
-            return True
+
+        with self._lock:
+            ask = self._answer(clip, commit)
+            if ask is not None:
+                self._skipped = ask
+            return ask is not None
 
     def explain(self, clip: int, reason: str) -> bool:
         """Says why the clip skipped last was skipped; False if it is another one.
@@ -148,83 +158,64 @@ class Desk:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            if clip != self.skipped:
+            if self._skipped is None or clip != self._skipped.clip:
                 return False
-            self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._done[-1].repeat)
-            self.skipped, self.explained = None, True
+            self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._skipped.repeat)
+            self._skipped, self.explained = None, True
             return True
 
-    def set_mark(self, clip: int, mark: Mark | None) -> bool:
-        """Notes where the clip on screen goes wrong, or that nothing is said of it; it goes with the rating.
+    def undo(self, clip: int) -> bool:
+        """Takes this rater's last rating or skip in the run back and shows its clip again.
 
         Returns:
-            False if another clip is on screen.
-
-        Raises:
-            ValueError: If the mark is no stretch of the clip.
-        """
-        with self._lock:
-            if clip != self.current:
-                return False
-            if mark is None:
-                self.mark = None
-                return True
-            self._seconds(clip, mark)  # or it is no stretch of this clip
-            self.mark = int(mark[0]), int(mark[1])
-            return True
-
-    def _seconds(self, clip: int, mark: Mark) -> tuple[float, float]:
-        shown = self._store.clip(clip)
-        if shown is None:
-            raise ValueError(f"no clip {clip}")
-        return seconds_of_pictures(
-            mark, shown.demo_step, shown.steps, dt=self._dt, fps=self._fps, frames=self._frames
-        )
-
-    def undo(self) -> bool:
-        """Takes the last rating or skip back and shows its clip again.
-
-        Returns:
-            False if there is none.
+            False if that is of another clip: it was taken back already, or something was said since.
 
         Raises:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            if not self._done:
+            last = self._store.last_answer(self._run, self.rater.id)
+            if last is None or last.clip != clip:
                 return False
-            ask = self._done[-1]
-            self._store.undo(ask.clip, self.rater.id, repeat=ask.repeat)
-            self._done.pop()
+            self._store.undo(clip, self.rater.id, repeat=last.repeat)
             if self._upcoming is not None and self._current is not None:
                 self._assignment.release(self._holder, self._upcoming.clip)
             self._upcoming = self._current or self._upcoming
-            self._show(Ask(ask.clip, ask.kind))
-            self.taken_back = ask
-            self.mark = ask.mark  # it is seen again, and goes with the next rating unless it is cleared
+            # It stays this rater's, whether or not others have rated it meanwhile.
+            self._show(Ask(clip, "repeated" if last.repeat else "shared"))
+            self.taken_back = last
             return True
 
     def close(self) -> None:
         """Frees the clips this page held."""
         self._assignment.release(self._holder)
 
-    def _accepted(self, clip: int) -> Ask | None:
-        in_time = self._clock() - self._shown_at >= GUARD_SECONDS
-        ask = self._current if clip == self.current and in_time else None
-        if ask is not None and self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat):
-            self._assignment.release(self._holder, ask.clip)
+    def _answer(self, clip: int, commit: Callable[[Ask], object]) -> Ask | None:
+        """Commits an answer to the clip on screen and moves on; None if the press counts for nothing."""
+        with self._lock:
+            ask = self._current
+            if ask is None or clip != ask.clip or self._clock() - self._shown_at < self._guard_seconds:
+                return None
+            try:
+                commit(ask)
+            except AlreadyAnswered:
+                self._assignment.release(self._holder, clip)
+                self._advance()
+                raise AnsweredElsewhere(
+                    "You had rated that clip at another page of yours: that answer stands."
+                ) from None
+            self._kind = self._assignment.again.draw(self._rng)
+            self._assignment.release(self._holder, clip)
             self._advance()
-            raise AnsweredElsewhere("You had rated that clip at another page of yours: that answer stands.")
-        return ask
+            return ask
 
     def _latency_ms(self) -> int:
         return round(1000 * (self._clock() - self._shown_at))
 
-    def _leave(self, ask: Ask) -> None:
-        self._done.append(ask)
-        self._kind = self._assignment.again.draw(self._rng)
-        self._assignment.release(self._holder, ask.clip)
-        self._advance()
+    def _pictures(self, clip: int) -> np.ndarray:
+        shown = self._store.clip(clip)
+        assert shown is not None
+        return picture_of_step(shown, self._dt, self._demo)
 
     def _advance(self) -> None:
         waiting = self._waiting()
@@ -271,8 +262,7 @@ class Desk:
 
     def _show(self, ask: Ask | None) -> None:
         self._current = ask
-        self.mark = self.skipped = self.taken_back = None
-        self.explained = False
+        self._skipped, self.taken_back, self.explained = None, None, False
         self._shown_at = self._clock()
         if ask is not None:
             self._assignment.hold(self._holder, ask.clip, now=self._shown_at)

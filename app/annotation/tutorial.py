@@ -50,23 +50,34 @@ class Lesson:
         """The one on screen."""
         return self.exercises[self.index]
 
-    def give(self, value: int) -> bool:
-        """Answers the exercise on screen; False if it has been."""
-        if self.answer is not None:
-            return False
-        self.answer = value
-        return True
+    def begin(self) -> None:
+        """From the first one on, (again)."""
+        self.index, self.answer = 0, None
 
-    def go_on(self) -> bool:
-        """To the next one, once this one is answered."""
-        if self.answer is None:
-            return False
-        self.index, self.answer = self.index + 1, None
-        return True
-
-    def leave(self) -> bool:
+    def leave(self) -> None:
         """Does without the rest."""
         self.index, self.answer = len(self.exercises), None
+
+    def take(self, exercise: int, do: int | str) -> bool:
+        """One press.
+
+        Args:
+            exercise: Index of the one that was on screen.
+            do: A rating; "next", once there is one; "leave" does without the rest.
+
+        Returns:
+            False if it counts for nothing.
+        """
+        if self.over or exercise != self.index:
+            return False
+        if do == "leave":
+            self.leave()
+        elif do == "next" and self.answer is not None:
+            self.index, self.answer = self.index + 1, None
+        elif isinstance(do, int) and self.answer is None:
+            self.answer = do
+        else:
+            return False
         return True
 
     @property

@@ -9,15 +9,17 @@ key handling added.
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import sqlite3
 import threading
-from functools import partial
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Protocol
 
 from aiohttp import web
 
+from onedemo.app.annotation.presses import PageGone, Press, read_press
+from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.http import assets
 from onedemo.app.http.auth import RATER, SECURITY_HEADERS, Door, Route
 from onedemo.app.http.bind import Listening
@@ -29,6 +31,8 @@ from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.types import Status
+
+log = logging.getLogger("onedemo.page")
 
 
 class Trained(Filmed, Protocol):
@@ -55,10 +59,8 @@ class Inside(Protocol):
         """Of its demo."""
         ...
 
-    def note(
-        self, rater_id: int, clip: int, *, mark: tuple[float, float] | None = None, reason: str | None = None
-    ) -> bool:
-        """What a browser says of a clip besides its rating."""
+    def press(self, rater_id: int, press: Press) -> bool:
+        """Carries out what somebody pressed; whether it counted."""
         ...
 
 
@@ -114,7 +116,7 @@ class Front:
             *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
             Route("GET", "/", "annotator", self._home),
             Route("GET", r"/r/{rater:\d{1,9}}", "annotator", self._page_of),
-            Route("POST", r"/r/{rater:\d{1,9}}/note", "annotator", self._note),
+            Route("POST", r"/r/{rater:\d{1,9}}/press", "annotator", self._press),
             Route("POST", r"/r/{rater:\d{1,9}}/do", "researcher", self._do),
             Route("GET", "/static/{name}", "annotator", files.static),
             Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
@@ -204,17 +206,19 @@ class Front:
         healthy = status.phase != "failed"
         return web.json_response({"ok": healthy, "version": version("onedemo"), "phase": status.phase})
 
-    async def _note(self, request: web.Request) -> web.Response:
+    async def _press(self, request: web.Request) -> web.Response:
+        body = await request.read()
         try:
-            note = read_note(await request.json())
-            noted = await asyncio.to_thread(partial(self._page.note, request[RATER].id, **note))
+            counted = await asyncio.to_thread(self._page.press, request[RATER].id, read_press(body))
+        except (PageGone, AnsweredElsewhere) as told:
+            raise web.HTTPConflict(text=str(told)) from None
         except ValueError as error:
-            raise web.HTTPBadRequest(text=f"This could not be noted: {error}.") from None
+            raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
         except sqlite3.Error as error:
-            raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
-        if not noted:
-            raise web.HTTPConflict(text="That clip is not on screen any more.")
-        return web.Response(status=204)
+            log.exception("a press could not be saved")
+            text = f"This could not be saved ({error}). Nothing is lost: please try again."
+            raise web.HTTPServiceUnavailable(text=text) from None
+        return web.json_response({"counted": counted})
 
     async def _do(self, request: web.Request) -> web.Response:
         try:
@@ -224,27 +228,6 @@ class Front:
         except sqlite3.Error as error:
             raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
         return web.Response(status=204)
-
-
-def read_note(body: Any) -> dict[str, Any]:
-    """What a browser says of a clip: ``{"clip": 7, "mark": [3, 6] or null}`` or ``{"clip", "reason"}``.
-
-    Raises:
-        ValueError: If it is anything else.
-    """
-    if not isinstance(body, dict) or set(body) not in ({"clip", "mark"}, {"clip", "reason"}):
-        raise ValueError("a note has a clip, and a mark or a reason")
-    clip, mark, reason = body["clip"], body.get("mark"), body.get("reason")
-    if type(clip) is not int or not 0 < clip < 2**53:
-        raise ValueError("a clip is a number")
-    if "reason" in body:
-        if not isinstance(reason, str) or not reason.strip() or not reason.isprintable():
-            raise ValueError("a reason is one line of text")
-        return {"clip": clip, "reason": reason.strip()}
-    numbers = mark if isinstance(mark, list) else ()
-    if mark is not None and not (len(numbers) == 2 and all(type(x) in (int, float) for x in numbers)):
-        raise ValueError("a mark is two numbers")
-    return {"clip": clip, "mark": None if mark is None else (float(mark[0]), float(mark[1]))}
 
 
 def _explain(error: BaseException, host: str, port: int) -> UserError:

@@ -28,7 +28,6 @@ from onedemo.storage.store import Store
 
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"
-SESSION_HEADER = "X-Onedemo-Session"
 SCHEME_HEADER = "X-Onedemo-Scheme"
 
 _LOOK_S = 1.0
@@ -92,7 +91,6 @@ class Proxy:
         identity = {
             RATER_HEADER: str(request[RATER].id),
             SECRET_HEADER: self._page.secret,
-            SESSION_HEADER: request[SESSION],
             SCHEME_HEADER: scheme,
         }
         inside = await self._upstream.ws_connect(

@@ -12,35 +12,30 @@ import logging
 import secrets
 import threading
 import warnings
-from collections.abc import Callable
 from typing import Any
 
 import rich
 import viser
-from viser import _messages
 
-from onedemo.app.annotation.assignment import Again, Ask, Assignment
-from onedemo.app.annotation.rating_session import Desk, Mark
-from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, SESSION_HEADER
-from onedemo.app.services.demo_images import Pictures
+from onedemo.app.annotation.assignment import Again, Assignment
+from onedemo.app.annotation.presses import PageGone, Press
+from onedemo.app.annotation.rating_session import GUARD_SECONDS
+from onedemo.app.annotation.tutorial import Lesson
+from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER
+from onedemo.app.services.demo_images import Pictures, version_of
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui import data_tab, guide_tab, rate_tab, runs_tab, watch_tab
 from onedemo.app.ui.compare_tab import Compare
+from onedemo.app.ui.context import TabContext
 from onedemo.app.ui.session import Session, TabMaker
+from onedemo.app.ui.viser_private import hang_up, lock_down, request_headers
 from onedemo.types import Rater
 
 log = logging.getLogger("onedemo.page")
 
 TICK_SECONDS = 0.5
 """How often counters, waiting states and curves are looked at."""
-
-_MESSAGES_LET_IN: tuple[type, ...] = (
-    _messages.ViewerCameraMessage,
-    _messages.GuiUpdateMessage,
-    _messages.CommandTriggerMessage,
-)
-"""What a browser may say: where it looks from, a slider moved, a key pressed. Nothing else."""
 
 
 class Page:
@@ -52,13 +47,14 @@ class Page:
         again: How many clips are asked again; the usual shares if not given.
         study: All runs; None if there is this one alone.
         compare: Whether annotators are asked pairs, too.
+        guard_seconds: A press that comes sooner after a clip was not made for it.
     """
 
     def __init__(
         self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None,
-        study: Study | None = None, compare: bool = False,
+        study: Study | None = None, compare: bool = False, guard_seconds: float = GUARD_SECONDS,
     ) -> None:  # fmt: skip
-        self.study, self.compare = study, compare
+        self.study, self._compare, self._guard_seconds = study, compare, guard_seconds
         self.secret = secrets.token_urlsafe(32)
         self._again = again or Again()
         self._attach(trainer, pictures)
@@ -79,7 +75,7 @@ class Page:
 
     def serve(self, trainer: Any) -> None:
         """Shows another run from now on: every browser gets a new page."""
-        self.live.close()
+        self._live.close()
         self._attach(trainer, None)
         for client in list(self._server.get_clients()):
             hang_up(self._server, client)  # browsers come back by themselves
@@ -87,12 +83,9 @@ class Page:
     def _attach(self, trainer: Any, pictures: Pictures | None) -> None:
         self.trainer = trainer
         self.pictures = pictures or Pictures(trainer.demo)
-        self.assignment = Assignment(again=self._again)
-        self.pair_assignment = Assignment()
-        self.live = Live(trainer.acting, trainer.demo.seconds)
-        self.desks: dict[int, Desk] = {}
-        """Where people rate, by client."""
-        self._done: dict[str, list[Ask]] = {}
+        self._assignment = Assignment(again=self._again)
+        self._pair_assignment = Assignment()
+        self._live = Live(trainer.acting, trainer.demo.seconds)
 
     def close(self) -> None:
         """Ends all sessions and the server behind them."""
@@ -102,29 +95,22 @@ class Page:
             sessions, self._sessions = list(self._sessions.values()), {}
         for session in sessions:
             session.close()
-        self.live.close()
+        self._live.close()
         self._server.stop()
 
-    def note(self, rater_id: int, clip: int, *, mark: Mark | None = None, reason: str | None = None) -> bool:
-        """What a browser says of a clip besides its rating.
-
-        Args:
-            rater_id: Who says it.
-            clip: Of which clip.
-            mark: Where it goes wrong; None takes that back, unless there is a reason.
-            reason: Why it was skipped.
-
-        Returns:
-            False if no page of the rater has that clip before it.
+    def press(self, rater_id: int, press: Press) -> bool:
+        """Carries out what somebody pressed at one of their pages; whether it counted.
 
         Raises:
-            ValueError: As ``Desk.set_mark`` and ``Desk.explain``.
-            sqlite3.Error: If it could not be committed.
+            PageGone: If no page of the rater goes by that name.
+            AnsweredElsewhere, ValueError, sqlite3.Error: As ``Session.press``.
         """
-        for desk in [desk for desk in list(self.desks.values()) if desk.rater.id == rater_id]:
-            if desk.explain(clip, reason) if reason is not None else desk.set_mark(clip, mark):
-                return True
-        return False
+        with self._lock:
+            sessions = list(self._sessions.values())
+        for session in sessions:
+            if session.token == press.page and session.rater.id == rater_id:
+                return session.press(press)
+        raise PageGone("This page had lost its connection. Please press again once it is back.")
 
     # One session per browser
 
@@ -138,11 +124,8 @@ class Page:
             hang_up(self._server, client.client_id)
             return
         try:
-            session = Session(
-                self, client, rater, dark=headers.get(SCHEME_HEADER) == "dark",
-                done=self._done.setdefault(headers[SESSION_HEADER], []),
-                makers=tabs_of(rater.role, compare=self.compare),
-            )  # fmt: skip
+            context = self._context(client, rater, dark=headers.get(SCHEME_HEADER) == "dark")
+            session = Session(context, tabs_of(rater.role, compare=self._compare))
         except Exception:
             log.exception("the page of %s could not be built", rater.name)
             hang_up(self._server, client.client_id)
@@ -151,6 +134,18 @@ class Page:
             self._sessions[client.client_id] = session
         if client.client_id not in self._server.get_clients():
             self._disconnect(client)  # It left while its page was being built.
+
+    def _context(self, client: viser.ClientHandle, rater: Rater, *, dark: bool) -> TabContext:
+        trainer, lesson = self.trainer, Lesson()
+        if trainer.store.has_practised(rater.id):
+            lesson.leave()
+        return TabContext(
+            client=client, rater=rater, dark=dark, lesson=lesson, store=trainer.store, run=trainer.run,
+            version=version_of(trainer.store, trainer.run), data_dir=trainer.data_dir, demo=trainer.demo,
+            dt=trainer.dt, training=trainer, pictures=self.pictures, live=self._live,
+            assignment=self._assignment, pair_assignment=self._pair_assignment,
+            guard_seconds=self._guard_seconds,
+        )  # fmt: skip
 
     def _disconnect(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -182,52 +177,3 @@ def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
     if role == "researcher":
         return [watch_tab.Watch, runs_tab.Runs, rate_tab.Rate, Compare, data_tab.Data, guide_tab.Guide]
     return [rate_tab.Rate, *([Compare] if compare else []), guide_tab.Guide]
-
-
-# Viser's private names, all of them; tests/system/test_viser_private.py holds them.
-
-
-def lock_down(server: viser.ViserServer) -> None:
-    """Leaves a client nothing to say to the server as a whole.
-
-    Viser would open a public tunnel for anyone who asks, and take uploads into memory.
-    """
-    server._websock_server._incoming_handlers.clear()
-    connect_callbacks = server._websock_server._client_connect_cb
-
-    def restrict(connection: Any) -> None:
-        handlers = connection._incoming_handlers
-        for kind in [kind for kind in handlers if kind not in _MESSAGES_LET_IN]:
-            del handlers[kind]
-        if _messages.GuiUpdateMessage in handlers:
-            handlers[_messages.GuiUpdateMessage] = [
-                _values_only(handler) for handler in handlers[_messages.GuiUpdateMessage]
-            ]
-
-    connect_callbacks.append(restrict)
-
-
-def request_headers(server: viser.ViserServer, client_id: int) -> Any:
-    """The HTTP headers a client's WebSocket was opened with; empty if it has gone."""
-    connection = server._websock_server._live_connections.get(client_id)
-    request = connection.request if connection is not None else None
-    return request.headers if request is not None else {}
-
-
-def hang_up(server: viser.ViserServer, client_id: int) -> None:
-    """Closes a client's connection."""
-    import asyncio
-
-    connection = server._websock_server._live_connections.get(client_id)
-    loop = server._websock_server._background_event_loop
-    if connection is not None and loop is not None:
-        asyncio.run_coroutine_threadsafe(connection.close(1008, "not through the front"), loop)
-
-
-def _values_only(handler: Callable) -> Callable:
-    # An update may name any property of a handle; a browser has reason to send only values.
-    async def checked(client_id: Any, message: Any) -> None:
-        if set(message.updates) == {"value"}:
-            await handler(client_id, message)
-
-    return checked

@@ -7,7 +7,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from markupsafe import Markup
@@ -15,11 +14,9 @@ from markupsafe import Markup
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.templates import render
+from onedemo.app.ui.context import TabContext
 from onedemo.storage.ratings import SKIP_COLUMNS
 from onedemo.types import Rater, Status
-
-if TYPE_CHECKING:
-    from onedemo.app.ui.session import Session
 
 log = logging.getLogger("onedemo.page")
 
@@ -32,21 +29,21 @@ class Data:
 
     title = "Data"
 
-    def __init__(self, session: Session) -> None:
-        self._trainer = session.page.trainer
+    def __init__(self, context: TabContext) -> None:
+        self._store, self._run, self._training = context.store, context.run, context.training
         self._shown = False
         self._counted = -1
         self._counted_at = 0.0
         self._busy = threading.Lock()
-        gui = session.client.gui
+        gui = context.client.gui
         self._html = gui.add_html("")
         # Drawn once, so that nothing that is being filled in is lost.
-        gui.add_html(str(export_html(self._trainer.run, str(self._trainer.store.path.absolute()))))
+        gui.add_html(str(export_html(self._run, str(self._store.path.absolute()))))
 
     def show(self) -> None:
         """Counts."""
         self._shown = True
-        self.refresh(self._trainer.status())
+        self.refresh(self._training.status())
 
     def hide(self) -> None:
         """Stops counting."""
@@ -54,7 +51,7 @@ class Data:
 
     def refresh(self, status: Status) -> None:
         """Counts again if somebody looks, beside the thread that serves all pages."""
-        event = self._trainer.store.last_event()
+        event = self._store.last_event()
         old = time.monotonic() - self._counted_at > _EVERY_S
         if not self._shown or event == self._counted or not (old or self._counted < 0):
             return
@@ -66,7 +63,7 @@ class Data:
 
     def _count(self, event: int, method: str) -> None:
         try:
-            store, run = self._trainer.store, self._trainer.run
+            store, run = self._store, self._run
             rows = rating_rows(store, run)
             skips = Counter(row[SKIP_COLUMNS.index("rater")] for row in store.iter_skips(run))
             people = {rater.name: rater for rater in store.raters()}

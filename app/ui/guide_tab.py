@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
 from onedemo.app.annotation.scale import ANSWERS, MEANINGS
 from onedemo.app.templates import render
 from onedemo.app.ui.clip_player import example_address, player_html
+from onedemo.app.ui.context import TabContext
 from onedemo.app.ui.strings import RATE_KEYS
 from onedemo.types import Status
-
-if TYPE_CHECKING:
-    from onedemo.app.ui.session import Session
 
 log = logging.getLogger("onedemo.page")
 
@@ -25,26 +22,19 @@ class Guide:
 
     title = "Guide"
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._pictures = session.page.pictures
-        self._html = session.client.gui.add_html(str(guide_html(None)))
+    def __init__(self, context: TabContext) -> None:
+        self._pictures = context.pictures
+        self._html = context.client.gui.add_html(str(guide_html(None)))
         self._loading = False
-        self._command: Any = None
 
     def show(self) -> None:
         """Fetches the examples the first time, without making anybody wait."""
         if not self._loading:
             self._loading = True
             threading.Thread(target=self._load, name="onedemo-guide", daemon=True).start()
-        self._command = self._session.client.gui.add_command("Practise again", hotkey="A", modifier="alt")
-        self._command.on_trigger(lambda _: self._session.practise())
 
     def hide(self) -> None:
-        """Takes the key away."""
-        if self._command is not None:
-            self._command.remove()
-            self._command = None
+        """Nothing to do: it holds nothing."""
 
     def refresh(self, status: Status) -> None:
         """Nothing to do: it does not change."""

@@ -1,24 +1,22 @@
 """The Rate tab: a clip, a question, five answers; before the first real one, two clips to practise with.
 
-The keys of a clip are commands made for that clip and removed with it, so a press names the clip
-that was on screen, however slow the line is. The buttons press the same keys (``static/page.js``).
+Keys and buttons are the browser's (``static/page.js``): a press comes as a request that names the clip that
+was on screen, however slow the line is. Here it is carried out, and what comes next is drawn.
 """
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from onedemo.app.annotation import presses
 from onedemo.app.annotation.rating_session import Desk
-from onedemo.app.annotation.scale import ANSWERS
-from onedemo.app.services.demo_images import version_of
-from onedemo.app.ui import rate_html as html
+from onedemo.app.annotation.scale import ANSWERS, REASONS
+from onedemo.app.templates import render
+from onedemo.app.ui.clip_player import example_address
+from onedemo.app.ui.context import TabContext
+from onedemo.app.ui.session import Pressing
 from onedemo.app.ui.strings import RATE_KEYS, keys_dialog
-from onedemo.app.ui.tab import Pressing
 from onedemo.types import Status
-
-if TYPE_CHECKING:
-    from onedemo.app.ui.session import Session
 
 _MIDDLE = 3
 
@@ -27,158 +25,128 @@ class Rate(Pressing):
     """The Rate tab of one session."""
 
     title = "Rate"
+    takes = (presses.Rate, presses.Skip, presses.Explain, presses.Undo, presses.Practise)
 
-    def __init__(self, session: Session) -> None:
-        page, trainer = session.page, session.page.trainer
-        self._session = session
-        self._store, self._run, self._fps = trainer.store, trainer.run, trainer.demo.fps
-        self._pictures, self._version = page.pictures, version_of(trainer.store, trainer.run)
-        super().__init__(session.client)
-        self.desk = Desk(
-            trainer.store, trainer.run, session.rater, page.assignment, session.client.client_id,
-            dt=trainer.dt, fps=trainer.demo.fps, frames=trainer.demo.frames, done=session.done,
+    def __init__(self, context: TabContext) -> None:
+        super().__init__(context.client)
+        self._context, self._lesson = context, context.lesson
+        self._desk = Desk(
+            context.store, context.run, context.rater, context.assignment, context.client.client_id,
+            dt=context.dt, demo=context.demo, guard_seconds=context.guard_seconds,
         )  # fmt: skip
-        page.desks[session.client.client_id] = self.desk
-        self._status: Status = trainer.status()
-        self._clip_keys: list[Any] = []
-        self._undo_keys: list[Any] = []
-        self._keys_for: Any = None
-        self._drawn: tuple[int, str] | None = None
-        self._mark: tuple[int, int] | None = None
-        gui = session.client.gui
+        self._status: Status = context.training.status()
+        self._clip: int | None = None
+        gui = context.client.gui
         self._notice, self._top = gui.add_html(""), gui.add_html("")
         self._stage = gui.add_html("")
         self._answering = gui.add_folder(None, visible=False)
         with self._answering:
             # Never redrawn: who presses a button with the keyboard keeps the focus on it.
-            gui.add_html(html.answers_html())
+            gui.add_html(str(render("rate.html:answers", labels=ANSWERS)))
             marks = tuple((value, str(value)) for value in range(1, 6))
             self._slider = gui.add_slider("Rating", 1, 5, 1, _MIDDLE, marks=marks)
-            gui.add_html(html.SUBMIT)
+            gui.add_html(str(render("rate.html:submit")))
         self._tools = gui.add_html("")
         self._ahead = gui.add_html("")
         gui.add_html(keys_dialog(RATE_KEYS))
 
     def show(self) -> None:
-        """Draws the tab and lets its keys act."""
+        """Draws the tab; presses count from now on."""
         with self._lock:
-            self._shown, self._drawn = True, None
-            if self._lesson is None:
-                self._attempt(self.desk.refill)
-            self._draw()
+            self._shown = True
+            self._look()
 
     def hide(self) -> None:
-        """Takes the keys away."""
+        """Presses do not count any more."""
         with self._lock:
             self._shown = False
-            self._remove_keys()
 
     def refresh(self, status: Status) -> None:
         """Looks for clips while there are none, and counts."""
         with self._lock:
             self._status = status
-            if self._shown and self._lesson is None:
-                self._attempt(self.desk.refill, keep_problem=True)
-                self._draw()
+            if self._shown:
+                self._look()
 
     def close(self) -> None:
         """Frees the clips for others."""
-        self._session.page.desks.pop(self._client.client_id, None)
-        self.desk.close()
+        self._desk.close()
 
-    @property
-    def _lesson(self) -> Any:
-        lesson = self._session.lesson
-        return None if lesson is None or lesson.over else lesson
+    def _look(self) -> None:
+        if self._lesson.over:
+            self._desk.refill()
+        self._draw()
 
-    # Presses
-
-    def _learn(self, step: Any) -> bool:
-        """One press in the lesson; after the last, the first real clip."""
-        moved = step()
-        if self._lesson is None:
-            self._store.set_practised(self._session.rater.id)
-            self.desk.refill()
-        return moved
+    def _carry_out(self, press: Any) -> bool:
+        match press:
+            case presses.Practise():
+                counted = self._lesson.take(press.exercise, press.do)
+                if counted and self._lesson.over:
+                    self._context.store.set_practised(self._context.rater.id)
+                    self._desk.refill()
+                return counted
+            case _ if not self._lesson.over:
+                return False
+            case presses.Rate():
+                return self._desk.rate(press.clip, press.value, press.mark)
+            case presses.Skip():
+                return self._desk.skip(press.clip)
+            case presses.Explain():
+                return self._desk.explain(press.clip, press.reason.strip())
+            case _:
+                return self._desk.undo(press.clip)
 
     # Drawing
 
     def _draw(self) -> None:
-        count = self._store.count_learned(self._run)  # as many as the trainer counts
-        with self._client.atomic():  # Clip and keys change together.
-            if self._lesson is not None:
-                self._draw_lesson()
+        with self._client.atomic():
+            if self._lesson.over:
+                self._draw_clip()
             else:
-                self._draw_clip(self.desk.current, count)
+                self._draw_lesson()
 
-    def _draw_clip(self, clip: int | None, count: int) -> None:
+    def _draw_clip(self) -> None:
+        context, desk, status = self._context, self._desk, self._status
+        clip, target = desk.current, status.target_ratings
+        count = context.store.count_learned(context.run)  # as many as the trainer counts
         asking = clip is not None
-        self._put(self._top, html.top_html(count, self._status.target_ratings, asking=asking))
-        if clip is not None:
-            # A mark is drawn by the browser; it is given back whenever the clip is drawn anew.
-            if self._drawn != (clip, self._problem):
-                self._drawn, self._mark = (clip, self._problem), self.desk.mark
-            self._put(self._stage, html.clip_html(clip, self._version, self._fps, self._problem, self._mark))
+        self._put(self._top, render("rate.html:top", count=count, target=target, asking=asking))
+        if asking:
+            source, fps = self._address(clip), context.demo.fps
+            stage = render("rate.html:clip", number=clip, source=source, fps=fps, mark=desk.mark)
         else:
-            self._put(self._stage, html.waiting_html(self._status, count, self._problem))
-        self._put(self._tools, html.tools_html(rating=asking, can_undo=self.desk.can_undo))
-        self._put(self._notice, html.notice_html(self.desk))
-        self._put(self._ahead, html.ahead_html(self.desk.upcoming, self._version))
+            done = 0 < target <= count
+            stage = render(
+                "rate.html:waiting", done=done, message=status.message, seconds=status.next_clips_s
+            )
+        self._put(self._stage, stage)
+        undoable = desk.undoable
+        undo = {"data-undo-clip": undoable} if undoable else None
+        self._put(self._tools, render("player.html:tools", kind="rate" if asking else "", undo=undo))
+        notice = render(
+            "rate.html:notice", skipped=desk.skipped, explained=desk.explained, taken_back=desk.taken_back,
+            labels=ANSWERS, reasons=REASONS,
+        )  # fmt: skip
+        self._put(self._notice, notice)
+        # Apart, so that the clip on screen is not drawn anew for it.
+        self._put(self._ahead, render("player.html:ahead", source=self._address(desk.upcoming)))
         self._show_answers(asking)
-        self._set_keys(clip)
+        if clip != self._clip:
+            self._clip, self._slider.value = clip, _MIDDLE
 
     def _draw_lesson(self) -> None:
-        lesson = self._lesson
-        self._put(self._top, html.lesson_top_html(lesson.index + 1, len(lesson.exercises)))
-        self._put(self._stage, html.lesson_html(lesson, self._pictures.demo, self._problem))
-        self._put(self._tools, html.tools_html(rating=True, can_undo=False, practising=True))
+        lesson, demo = self._lesson, self._context.demo
+        top = render("rate.html:lesson_top", number=lesson.index + 1, of=len(lesson.exercises))
+        source = example_address(lesson.exercise.example, demo.sha256)
+        self._put(self._top, top)
+        self._put(self._stage, render("rate.html:lesson", lesson=lesson, source=source, fps=demo.fps))
+        self._put(self._tools, render("player.html:tools", kind="practice", undo=None))
         self._put(self._notice, "")
         self._show_answers(lesson.answer is None)
-        key = ("lesson", lesson.index, lesson.answer)
-        if key != self._keys_for:
-            self._remove_keys()
-            self._keys_for = key
-            if lesson.answer is None:
-                for value, answer in enumerate(ANSWERS, start=1):
-                    step = partial(self._learn, partial(lesson.give, value))
-                    self._clip_keys.append(self._key(f"{value}: {answer}", str(value), step))
-            else:
-                self._clip_keys.append(self._key("Go on", "G", partial(self._learn, lesson.go_on)))
-            self._clip_keys.append(self._key("Skip the practice", "S", partial(self._learn, lesson.leave)))
+
+    def _address(self, clip: int | None) -> str | None:
+        return f"/clips/{clip}.jpg?v={self._context.version}" if clip is not None else None
 
     def _show_answers(self, visible: bool) -> None:
         if self._answering.visible != visible:
             self._answering.visible = visible
-
-    def _set_keys(self, clip: int | None) -> None:
-        if clip != self._keys_for:
-            _remove(self._clip_keys)
-            if clip is not None:
-                if self._slider.value != _MIDDLE:
-                    self._slider.value = _MIDDLE
-                for value, answer in enumerate(ANSWERS, start=1):
-                    action = partial(self.desk.rate, clip, value)
-                    self._clip_keys.append(self._key(f"{value}: {answer}", str(value), action))
-                self._clip_keys.append(self._key("Skip this one", "S", partial(self.desk.skip, clip)))
-            self._keys_for = clip
-        if self.desk.can_undo != bool(self._undo_keys):
-            _remove(self._undo_keys)
-            if self.desk.can_undo:
-                for hotkey in ("U", "backspace"):
-                    self._undo_keys.append(self._key("Take the last one back", hotkey, self.desk.undo))
-
-    def _key(self, label: str, hotkey: Any, action: Any) -> Any:
-        command = self._client.gui.add_command(label, hotkey=hotkey)
-        command.on_trigger(lambda _: self._press(action))
-        return command
-
-    def _remove_keys(self) -> None:
-        _remove(self._clip_keys)
-        _remove(self._undo_keys)
-        self._keys_for = None
-
-
-def _remove(commands: list[Any]) -> None:
-    for command in commands:
-        command.remove()
-    commands.clear()

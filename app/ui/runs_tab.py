@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from markupsafe import Markup
 
 from onedemo.app.http.uploads import LARGEST
 from onedemo.app.templates import render
 from onedemo.app.ui import charts
+from onedemo.app.ui.context import TabContext
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
 from onedemo.types import HALTED, Status
-
-if TYPE_CHECKING:
-    from onedemo.app.ui.session import Session
 
 _NEWEST = 6
 """Runs that are compared before anybody says which."""
@@ -29,27 +27,26 @@ class Runs:
 
     title = "Runs"
 
-    def __init__(self, session: Session) -> None:
-        page = session.page
-        self._store, self._run, self._trainer = page.trainer.store, page.trainer.run, page.trainer
+    def __init__(self, context: TabContext) -> None:
+        self._store, self._run, self._training = context.store, context.run, context.training
         self._lock = threading.RLock()
         self._shown = False
         self._rows: dict[str, list[dict]] = {}
         self._told = ""
-        gui = session.client.gui
+        gui = context.client.gui
         self._table = gui.add_html("")
         self._wanted = gui.add_text("Compare", "", hint="Names or parts of names, with commas between")
-        self._wanted.on_update(lambda _: self.refresh(self._trainer.status()))
+        self._wanted.on_update(lambda _: self.refresh(self._training.status()))
         self._told_which = gui.add_html("")
-        self._client, self._drawn = session.client, []
+        self._client, self._drawn = context.client, []
         self._curves = [
-            charts.Comparison(gui, key, title, dark=session.dark)
+            charts.Comparison(gui, key, title, dark=context.dark)
             for key, title in (
                 ("predicted", "Predicted rating (1 to 5)"),
                 ("true_reward", "True reward of an episode (points; never trained on)"),
             )
         ]
-        demos = [demo.name for demo in list_demos(page.trainer.data_dir / "demos")]
+        demos = [demo.name for demo in list_demos(context.data_dir / "demos")]
         # The forms are drawn once, so that nothing that is being filled in is lost.
         runs = [entry["id"] for entry in self._store.runs()]
         gui.add_html(str(render("runs.html:new_run", demos=demos, methods=list(METHODS), runs=runs)))
@@ -59,7 +56,7 @@ class Runs:
         """Lists the runs."""
         with self._lock:
             self._shown = True
-            self.refresh(self._trainer.status())
+            self.refresh(self._training.status())
 
     def hide(self) -> None:
         """Stops following."""

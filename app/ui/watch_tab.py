@@ -6,21 +6,18 @@ import math
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 from markupsafe import Markup
 from mjviser import ViserMujocoScene
 
 from onedemo.app.annotation.scale import ANSWERS
-from onedemo.app.services.demo_images import version_of
 from onedemo.app.services.live_rollout import Moment
 from onedemo.app.templates import render
 from onedemo.app.ui import charts, progress
+from onedemo.app.ui.context import TabContext
 from onedemo.types import HALTED, Status
-
-if TYPE_CHECKING:
-    from onedemo.app.ui.session import Session
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""
@@ -39,13 +36,10 @@ class Watch:
 
     title = "Watch"
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
-        self._client = session.client
-        self._trainer = session.page.trainer
-        self._live = session.page.live
-        self._demo = self._trainer.demo
-        self._version = version_of(self._trainer.store, self._trainer.run)
+    def __init__(self, context: TabContext) -> None:
+        self._context, self._client = context, context.client
+        self._training, self._store, self._run = context.training, context.store, context.run
+        self._live, self._demo, self._version = context.live, context.demo, context.version
         self._lock = threading.RLock()
         self._scene: ViserMujocoScene | None = None
         self._frame = -1
@@ -54,7 +48,7 @@ class Watch:
         self._commands: list[Any] = []
         self._shown = False
         self._content: dict[int, str] = {}
-        gui = session.client.gui
+        gui = context.client.gui
         self._strip = gui.add_html("")
         gui.add_html(str(render("watch.html:robot")))
         self._picture = gui.add_html("")
@@ -62,7 +56,7 @@ class Watch:
         self._parts = gui.add_html(str(progress.timeline_html([], self._demo.seconds)))
         frames = [frame_address(n, self._demo.sha256) for n in range(self._demo.frames)]
         gui.add_html(str(render("watch.html:preload", sources=frames)))
-        self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=session.dark)
+        self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=context.dark)
         self._classes = gui.add_html("")
         self._gallery = gui.add_html("")
         gui.add_html(str(render("watch.html:film")))
@@ -78,7 +72,7 @@ class Watch:
             self._live.watch(self._client.client_id, self._draw)
             self._key("Pause or resume training", "P", self._toggle)
             self._key("Stop training", "X", self._stop)
-            self.refresh(self._trainer.status())
+            self.refresh(self._training.status())
 
     def hide(self) -> None:
         """Stops them."""
@@ -95,7 +89,7 @@ class Watch:
             if not self._shown:
                 return
             self._practised = status.iteration > 0
-            store, run = self._trainer.store, self._trainer.run
+            store, run = self._store, self._run
             counts = store.ratings_by_class(run)
             strip = render(
                 "watch.html:strip", status=status, confirming=time.monotonic() < self._confirm_until,
@@ -121,13 +115,13 @@ class Watch:
         self._commands.append(command)
 
     def _toggle(self) -> None:
-        if self._trainer.status().phase in HALTED:
-            self._trainer.resume()
+        if self._training.status().phase in HALTED:
+            self._training.resume()
             self._log("resumed the run")
         else:
-            self._trainer.pause()
+            self._training.pause()
             self._log("paused the run")
-        self.refresh(self._trainer.status())
+        self.refresh(self._training.status())
 
     def _stop(self) -> None:
         # Stopping takes a second press: it cannot be taken back from here.
@@ -136,11 +130,11 @@ class Watch:
             self._confirm_until = 0.0 if sure else time.monotonic() + _CONFIRM_SECONDS
         if sure:
             self._log("stopped the run")
-            self._trainer.stop()
-        self.refresh(self._trainer.status())
+            self._training.stop()
+        self.refresh(self._training.status())
 
     def _log(self, what: str) -> None:
-        self._trainer.store.add_audit(self._session.rater.name, what, self._trainer.run)
+        self._store.add_audit(self._context.rater.name, what, self._run)
 
     # The robot
 

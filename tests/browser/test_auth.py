@@ -360,17 +360,19 @@ def test_one_person_opens_only_so_many_pages(site, monkeypatch):
 
 @pytest.mark.seam
 def test_a_clip_that_somebody_else_holds_cannot_be_rated(site):
-    """Each page triggers only what is its own: another's keys do nothing."""
+    """Each page answers only what is its own: neither another's clip nor another's page."""
 
     async def go():
         async with browser_session() as session:
             bo, cy = [await open_tab(session, site.links[who]) for who in ("annotator", "second annotator")]
             for tab in (bo, cy):
-                await tab.until(lambda tab=tab: tab.clip and "3" in tab.keys, "a clip")
+                await tab.until(lambda tab=tab: tab.clip and tab.token, "a clip")
             assert bo.clip != cy.clip
             before = cy.clip
-            await bo._say({"type": "CommandTriggerMessage", "uuid": cy.keys["3"]})
-            await bo._say({"type": "GuiUpdateMessage", "uuid": cy.keys["3"], "updates": {"value": True}})
+            await asyncio.sleep(0.7)
+            rating = {"press": "rate", "clip": cy.clip, "value": 3}
+            assert await bo.post(**rating) == (200, '{"counted": false}')
+            assert (await bo.post(**rating, page=cy.token))[0] == 409
             await asyncio.sleep(0.7)
             assert cy.clip == before
             for tab in (bo, cy):

@@ -25,7 +25,7 @@ def rate_some(site):
     ids = site.trainer.add_clips(30)
     ann, bob = (store.ensure_rater(name, "annotator").id for name in ("Ann", "Bob <i>"))
     for k, clip in enumerate(ids):
-        store.rate(clip, ann, k % 5 + 1, 1500, mark=(0.1, 0.2) if k == 0 else None)
+        store.rate(clip, ann, k % 5 + 1, 1500, mark=(13, 25) if k == 0 else None)
         store.rate(clip, bob, 3, 320)
         if k % 10 == 0:
             store.rate(clip, ann, k % 5 + 1, 1500, repeat=True)

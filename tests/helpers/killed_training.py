@@ -88,7 +88,7 @@ def outcome(data_dir: Path) -> dict:
     """What a training leaves behind, but for times."""
     with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:
         rows = {
-            "ratings": "SELECT clip_id, kind, value, mark_start, mark_end FROM events ORDER BY id",
+            "ratings": "SELECT clip_id, kind, value, mark_from, mark_to FROM events ORDER BY id",
             "clips": "SELECT id, demo_step, stage, iteration, snapshot, predicted, choice, score FROM clips",
             "segments": "SELECT clip_id, hex(data) FROM segments ORDER BY clip_id",
             "snapshots": "SELECT number, last_event, ratings FROM snapshots ORDER BY number",

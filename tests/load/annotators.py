@@ -1,7 +1,7 @@
 """People at the page, played by one light process: what a browser sends and receives, without drawing.
 
 An annotator opens its link, reads the page's messages, learns from them which clip is on screen and
-which command is which key, fetches the pictures a browser would, and presses keys. The clock of a
+which command is which key, fetches the pictures a browser would, and answers. The clock of a
 press stops when the next clip's message and its picture are both there, as ``page.js`` lets nobody
 rate a picture that has not come.
 """
@@ -16,11 +16,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from urllib.parse import urljoin, urlsplit
+from uuid import uuid4
 
 import aiohttp
 import msgspec
 import zstandard
 
+_PAGE = re.compile(r'data-page="([^"]+)"')
 _CLIP = re.compile(r'data-clip="(\d+)"')
 _AHEAD = re.compile(r'data-ahead="/clips/(\d+)\.jpg\b')
 _WAITING = 'class="od-waiting"'
@@ -54,6 +56,8 @@ class Tab:
 
     base: str
     """Address of the front, ``http://127.0.0.1:PORT``."""
+    address: str
+    """Of the page."""
     session: aiohttp.ClientSession
     socket: aiohttp.ClientWebSocketResponse
     headers: dict[str, str]
@@ -63,7 +67,9 @@ class Tab:
     waiting: bool = False
     """Whether the page says that there is nothing to rate."""
     keys: dict[str, str] = field(default_factory=dict)
-    """Command by its key, such as "3" or "alt+P"."""
+    """Command by its key, such as "alt+P"."""
+    token: str = ""
+    """What the page is called in requests."""
     presses: list[Press] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -75,25 +81,34 @@ class Tab:
         self._reader = asyncio.create_task(self._read())
 
     async def rate(self, value: int) -> Press:
-        """Presses the digit, a moment after the clip came at the earliest, and waits for what comes next.
+        """Gives the rating, a moment after the clip came at the earliest, and waits for what comes next.
 
         That is the next clip, or the note that there is none just now.
 
         Raises:
-            RuntimeError: If there is no clip to rate, or nothing comes.
+            RuntimeError: If there is no clip to rate, the rating does not count, or nothing comes.
         """
         await asyncio.sleep(self._shown_at + _JUDGING_S - time.monotonic())
         before = self.clip
         if before is None:
             raise RuntimeError("there is no clip on screen to rate")
         at, began = time.time(), time.perf_counter()
-        await self.press(str(value))
+        answer = await self.post(press="rate", clip=before, value=value)
+        if answer != (200, '{"counted": true}'):
+            raise RuntimeError(f"a rating did not count: {answer}")
         await self.until(lambda: self.clip != before, f"a clip after {before}")
         if self.clip is not None:
             await self._pictures[self.clip]
         press = Press(clip=before, value=value, at=at, seconds=time.perf_counter() - began)
         self.presses.append(press)
         return press
+
+    async def post(self, **press: object) -> tuple[int, str]:
+        """Sends a press, as a browser does; status and text of what is answered to it."""
+        body = {"page": self.token, "id": str(uuid4())} | press
+        headers = self.headers | {"Origin": self.base}
+        async with self.session.post(f"{self.address}/press", json=body, headers=headers) as answer:
+            return answer.status, await answer.text()
 
     async def press(self, key: str) -> None:
         """Presses a key and waits for nothing.
@@ -163,7 +178,9 @@ class Tab:
             self._show(message["updates"]["content"])
 
     def _show(self, html: str) -> None:
-        if found := _CLIP.search(html):
+        if found := _PAGE.search(html):
+            self.token = found[1]
+        elif found := _CLIP.search(html):
             if self.clip != int(found[1]):
                 self._shown_at = time.monotonic()
             self.clip, self.waiting = int(found[1]), False
@@ -209,7 +226,7 @@ async def open_tab(session: aiohttp.ClientSession, link: str) -> Tab:
     socket = await session.ws_connect(
         page, headers=headers | {"Origin": base}, protocols=[f"viser-v{version('viser')}"], max_msg_size=0
     )
-    tab = Tab(base=base, session=session, socket=socket, headers=headers)
+    tab = Tab(base=base, address=page, session=session, socket=socket, headers=headers)
     await tab._say(_CAMERA)  # what makes Viser count the browser as connected
     return tab
 

@@ -116,10 +116,10 @@ def _training_set(quick: bool) -> Growth:
             for size in sizes:
                 _fill(store.path, known, size, segment=pack_segment(segment))
                 known = size
-                training_set, event = TrainingSet(store, _RUN, 0.008), store.last_event()
+                training_set, event = TrainingSet(store, _RUN), store.last_event()
                 assert len(training_set.at(event - 10)) == size - 10
                 again.append(_seconds(training_set.at, event))
-                whole.append(_seconds(TrainingSet(store, _RUN, 0.008).at, event))
+                whole.append(_seconds(TrainingSet(store, _RUN).at, event))
     return Growth(
         name="training_set_growth", title="Loading the ratings for a refit", x_label="ratings", y_label="s",
         x=list(sizes), y={"first refit of a process": whole, "next refit, 10 new ratings": again},

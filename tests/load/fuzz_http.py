@@ -226,15 +226,15 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
 def hostile_request(rng: random.Random, cookie: str) -> bytes:
     """One HTTP request, from an annotator or a stranger, whole or broken."""
     paths = (
-        "/", "/login?token=x", "/login", "/healthz", "/r/2", "/r/1", "/r/2/note", "/r/1/do", "/r/2/do",
+        "/", "/login?token=x", "/login", "/healthz", "/r/2", "/r/1", "/r/2/press", "/r/1/do", "/r/2/do",
         "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg", "/rollouts/1.webm", "/export.csv", "/preview",
         "/segments.parquet", "/card.md", "/static/page.css", "/static/..%2f..%2fpyproject.toml",
         "/clips/%00.jpg", "/clips/99999999999999999999.jpg", "/demos", "//", "/r/000000002", "*", "http://x/",
     )  # fmt: skip
     methods = ("GET", "POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE", "CONNECT", "PATCH", "G\0T", "")
     bodies = (
-        b"", b"{}", b"[" * 3000, b'{"clip": 1e999, "mark": [0, 1]}', b'{"clip": 1, "reason": "x"}',
-        b"\xff\xfe",
+        b"", b"{}", b"[" * 3000, b'{"press": "rate", "clip": 1e999}',
+        b'{"press": "rate", "page": "x", "id": "1", "clip": 1, "value": 3, "mark": [0, 1]}', b"\xff\xfe",
         b'{"do": "leave out", "rater": 2}', b'{"do": "new run"}', b"x" * 70_000,
     )  # fmt: skip
     path = rng.choice(paths)
@@ -287,7 +287,7 @@ async def send_messages(
                 findings.count("sockets refused")
         busy = 0
         while sent < count and len(findings.broken) < 20:
-            before = set(page.desks)
+            before = set(page._sessions)
             try:
                 socket = await session.ws_connect(
                     url + place, headers=headers, protocols=[f"viser-v{viser.__version__}"]
@@ -306,7 +306,7 @@ async def send_messages(
             findings.count("sockets")
             async with socket:
                 await asyncio.wait_for(socket.receive(), ANSWER_SECONDS)
-                originals = page_messages(handles(page, set(page.desks) - before))
+                originals = page_messages(handles(page, set(page._sessions) - before))
                 reader = asyncio.ensure_future(drain(socket))
                 for _ in range(200):
                     if socket.closed or reader.done() or sent >= count:

@@ -85,7 +85,7 @@ EXAMPLES = {
 """What the places in a route's path may be; the rater is the annotator."""
 STRANGERS_MAY = {"/login", "/healthz", "/static/login.css", "/static/icon.svg"}
 ANNOTATORS_MAY = {
-    "/", "/r/2", "/r/2/note", "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
+    "/", "/r/2", "/r/2/press", "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
     "/demo/examples/far.jpg",
 }  # fmt: skip
 

@@ -9,7 +9,7 @@ from viser import _messages
 
 from helpers.beside_playwright import run
 from onedemo.app.http import assets
-from onedemo.app.ui import app
+from onedemo.app.ui import app, viser_private
 
 pytestmark = pytest.mark.seam
 
@@ -74,5 +74,5 @@ def test_roles_get_their_tabs():
 
 
 def test_only_known_messages_are_let_in():
-    assert _messages.ShareUrlRequest not in app._MESSAGES_LET_IN
-    assert _messages.FileTransferStartUpload not in app._MESSAGES_LET_IN
+    assert _messages.ShareUrlRequest not in viser_private.MESSAGES_LET_IN
+    assert _messages.FileTransferStartUpload not in viser_private.MESSAGES_LET_IN

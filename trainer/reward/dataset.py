@@ -17,11 +17,10 @@ class TrainingSet:
     Args:
         store: Holds ratings and segments.
         run: Whose ratings.
-        dt: Seconds of a control step.
     """
 
-    def __init__(self, store: Store, run: str, dt: float) -> None:
-        self._store, self._run, self._dt = store, run, dt
+    def __init__(self, store: Store, run: str) -> None:
+        self._store, self._run = store, run
         self._kept: dict[int, RatedSegment] = {}
 
     def at(self, event: int) -> list[RatedSegment]:
@@ -48,13 +47,5 @@ class TrainingSet:
         )
         return RatedSegment(
             event=rating.event, demo_step=rating.demo_step, segment=segment, value=rating.value,
-            mark=self._steps(rating, len(whole)),
+            mark=rating.mark,
         )  # fmt: skip
-
-    def _steps(self, rating: Rating, steps: int) -> tuple[int, int] | None:
-        """The steps of a mark: those that a person saw in it."""
-        if rating.mark_start is None or rating.mark_end is None:
-            return None
-        first, after = round(rating.mark_start / self._dt), round(rating.mark_end / self._dt)
-        first = min(first, steps - 1)  # the last picture shows what comes to the end of the clip
-        return first, max(first + 1, after)

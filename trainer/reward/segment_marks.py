@@ -17,37 +17,50 @@ import numpy as np
 
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.storage.store import RatedSegment
-from onedemo.types import Segment
+from onedemo.types import Clip, Demo, Segment
 
+Mark = tuple[int, int]
+"""A stretch of a clip, in control steps or in pictures: the first, and the one after the last."""
 INSIDE, OUTSIDE = 0, 1
 """Points that the marked steps and the others differ from the rating of their clip."""
 
 
-def seconds_of_pictures(
-    pictures: tuple[float, float], demo_step: int, steps: int, *, dt: float, fps: float, frames: int
-) -> tuple[float, float]:
-    """The stretch of a clip during which some of its pictures are on screen, seconds from its start.
+def picture_of_step(clip: Clip, dt: float, demo: Demo) -> np.ndarray:
+    """Which picture of a clip is on screen at each of its control steps: (W,), from 0 on.
 
-    A picture stays until the control step at which the next one is due, so pictures are of unequal length:
-    3 or 4 steps at 30 per second and 0.008 s. Both ends are whole steps; ``TrainingSet`` gets these back.
+    A picture stays until the step at which the next one is due, so pictures are of unequal length: 4 or 5
+    steps at 30 per second and 0.008 s.
 
     Args:
-        pictures: The first of them, and the one after the last; whole numbers.
-        demo_step: Control step of the demo at which the clip begins.
-        steps: Its length.
+        clip: W steps.
         dt: Seconds of a control step.
-        fps: Pictures per second of the demo.
-        frames: Pictures of the demo.
+        demo: What is beside it.
+    """
+    shown = frame_of_step(clip.demo_step + np.arange(clip.steps), dt, demo.fps, demo.frames)
+    return np.unique(shown, return_inverse=True)[1]
+
+
+def steps_of_pictures(pictures: Mark, picture_of_step: np.ndarray) -> Mark:
+    """The control steps of a clip during which some of its pictures are on screen.
+
+    Args:
+        pictures: The first of them, and the one after the last.
+        picture_of_step: As of that function.
 
     Raises:
         ValueError: If they are no stretch of the clip's pictures.
     """
-    shown = frame_of_step(demo_step + np.arange(steps), dt, fps, frames)
-    edges = [*np.unique(shown, return_index=True)[1].tolist(), steps]
     first, after = pictures
-    if not (first in range(len(edges)) and after in range(len(edges)) and first < after):
-        raise ValueError(f"a mark is a stretch of the clip's {len(edges) - 1} pictures, got {pictures}")
-    return round(edges[int(first)] * dt, 6), round(edges[int(after)] * dt, 6)
+    count = int(picture_of_step[-1]) + 1
+    if not 0 <= first < after <= count:
+        raise ValueError(f"a mark is a stretch of the clip's {count} pictures, got {pictures}")
+    start, end = np.searchsorted(picture_of_step, pictures).tolist()
+    return start, end
+
+
+def pictures_of_steps(steps: Mark, picture_of_step: np.ndarray) -> Mark:
+    """The pictures that are on screen during some of a clip's steps: first, and the one after the last."""
+    return int(picture_of_step[steps[0]]), int(picture_of_step[steps[1] - 1]) + 1
 
 
 def marked_steps(rating: RatedSegment) -> np.ndarray:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from onedemo.storage.database import Database, now
+from onedemo.storage.ratings import AlreadyAnswered
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
 from onedemo.types import Segment
 
@@ -108,8 +109,8 @@ class Pairs(Database):
             latency_ms: From the pair on screen to the press.
 
         Raises:
-            ValueError: If it is no answer, there is no such pair, the rater's answer holds already or
-                there is none to take back.
+            AlreadyAnswered: If the rater's answer holds already.
+            ValueError: If it is no answer, there is no such pair, or there is none to take back.
         """
         if answer not in (*ANSWERS, "skip", "undo"):
             raise ValueError(f"a pair is {', '.join(ANSWERS)} or skipped, not {answer!r}")
@@ -122,8 +123,10 @@ class Pairs(Database):
             if not rows:
                 raise ValueError(f"no pair {pair_id}")
             holds = rows[0][0] not in (None, "undo")
-            if holds != (answer == "undo"):
-                raise ValueError(f"pair {pair_id} is answered already" if holds else "nothing to take back")
+            if holds and answer != "undo":
+                raise AlreadyAnswered(f"pair {pair_id} is answered already")
+            if not holds and answer == "undo":
+                raise ValueError("nothing to take back")
             cursor = db.execute(
                 "INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
                 " VALUES (?, ?, ?, ?, ?)",
@@ -132,13 +135,16 @@ class Pairs(Database):
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
-    def compared(self, pair_id: int, rater_id: int) -> bool:
-        """Whether an answer or skip of a rater stands on a pair."""
+    def last_compared(self, run: str, rater_id: int) -> int | None:
+        """The pair that a rater answered or skipped last in a run, of those that hold, or None."""
         rows = self.rows(
-            "SELECT answer FROM comparisons WHERE pair_id = ? AND rater_id = ? ORDER BY id DESC LIMIT 1",
-            (pair_id, rater_id),
+            "SELECT c.pair_id FROM comparisons c JOIN pairs p ON p.id = c.pair_id"
+            " WHERE c.rater_id = ?1 AND p.run = ?2 AND c.answer != 'undo' AND NOT EXISTS ("
+            "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
+            "  AND l.id > c.id) ORDER BY c.id DESC LIMIT 1",
+            (rater_id, run),
         )
-        return bool(rows) and rows[0][0] != "undo"
+        return rows[0][0] if rows else None
 
     def count_comparisons(self, run: str) -> int:
         """How many answers hold in a run."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -32,9 +31,8 @@ class Rating(NamedTuple):
     clip: int
     demo_step: int
     value: int
-    mark_start: float | None
-    """Where it goes wrong, seconds from the start of the clip; None: not said."""
-    mark_end: float | None
+    mark: tuple[int, int] | None
+    """Where it goes wrong: first control step of the clip, step after the last; None: not said."""
 
 
 class Answered(NamedTuple):
@@ -60,12 +58,27 @@ class RatedSegment:
     """Where it goes wrong: first step, step after the last."""
 
 
+class LastAnswer(NamedTuple):
+    """What a rater said last that holds: what undo takes back."""
+
+    clip: int
+    repeat: bool
+    value: int | None
+    """None: it was skipped."""
+    mark: tuple[int, int] | None
+    """As ``RatedSegment.mark``."""
+
+
+class AlreadyAnswered(ValueError):
+    """The rater's answer to a clip or pair holds already."""
+
+
 class Answers(Database):
     """Rating events."""
 
     def rate(
         self, clip_id: int, rater_id: int, value: int, latency_ms: int, *,
-        mark: tuple[float, float] | None = None, repeat: bool = False,
+        mark: tuple[int, int] | None = None, repeat: bool = False,
     ) -> int:  # fmt: skip
         """Commits one rating and returns its event number.
 
@@ -74,13 +87,14 @@ class Answers(Database):
             rater_id: By whom.
             value: 1 to 5.
             latency_ms: From the clip on screen to the press.
-            mark: Where it goes wrong, seconds from the start of the clip.
+            mark: Where it goes wrong: first control step of the clip, step after the last.
             repeat: It is the rater's second opinion, to see how steady the first one was: it is kept
                 beside it, and nothing learns from it.
 
         Raises:
-            ValueError: If the value is not a whole number from 1 to 5, there is no such clip, the mark
-                does not lie on it, or the rater's rating of this clip holds already.
+            AlreadyAnswered: If the rater's rating of this clip holds already.
+            ValueError: If the value is not a whole number from 1 to 5, there is no such clip, or the mark
+                is no stretch of its steps.
         """
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 5:
             raise ValueError(f"a rating is a whole number from 1 to 5, got {value!r}")
@@ -110,38 +124,36 @@ class Answers(Database):
 
     def _event(
         self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int, *,
-        mark: tuple[float, float] | None = None, reason: str | None = None, repeat: bool = False,
+        mark: tuple[int, int] | None = None, reason: str | None = None, repeat: bool = False,
     ) -> int:  # fmt: skip
         with self.transaction() as db:
             clip = db.execute(
-                "SELECT c.snapshot, c.predicted, (SELECT e.kind || (e.reason IS NOT NULL) FROM events e"
-                "  WHERE e.clip_id = c.id AND e.rater_id = ?1 AND e.repeat = ?2 ORDER BY e.id DESC LIMIT 1)"
+                "SELECT c.snapshot, c.predicted, c.steps, (SELECT e.kind || (e.reason IS NOT NULL)"
+                "  FROM events e WHERE e.clip_id = c.id AND e.rater_id = ?1 AND e.repeat = ?2"
+                "  ORDER BY e.id DESC LIMIT 1)"
                 " FROM clips c WHERE c.id = ?3",
                 (rater_id, repeat, clip_id),
             ).fetchone()
             if clip is None:
                 raise ValueError(f"no clip {clip_id}")
-            *predicted, last = clip
+            snapshot, predicted, steps, last = clip
             holds = last is not None and not last.startswith("undo")
             if kind == "undo" and not holds:
                 raise ValueError(f"clip {clip_id} has nothing to take back")
             if kind != "undo" and holds and not (reason is not None and last == "skip0"):
-                raise ValueError(f"clip {clip_id} is rated already by this rater")
+                raise AlreadyAnswered(f"clip {clip_id} is rated already by this rater")
+            if mark is not None and not 0 <= mark[0] < mark[1] <= steps:
+                raise ValueError(f"a mark is a stretch of the clip's {steps} steps, got {mark}")
             row = {
                 "clip_id": clip_id, "rater_id": rater_id, "kind": kind, "value": value, "repeat": repeat,
-                "mark_start": mark[0] if mark else None, "mark_end": mark[1] if mark else None,
-                "reason": reason, "snapshot": predicted[0], "predicted": predicted[1],
+                "mark_from": mark[0] if mark else None, "mark_to": mark[1] if mark else None,
+                "reason": reason, "snapshot": snapshot, "predicted": predicted,
                 "latency_ms": max(0, int(latency_ms)), "created_at": now(),
             }  # fmt: skip
-            try:
-                cursor = db.execute(
-                    f"INSERT INTO events ({', '.join(row)}) VALUES ({', '.join('?' * len(row))})",
-                    tuple(row.values()),
-                )
-            except sqlite3.IntegrityError:
-                if mark is None:
-                    raise
-                raise ValueError(f"a mark is a stretch of the clip in seconds, got {mark}") from None
+            cursor = db.execute(
+                f"INSERT INTO events ({', '.join(row)}) VALUES ({', '.join('?' * len(row))})",
+                tuple(row.values()),
+            )
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
@@ -184,6 +196,20 @@ class Answers(Database):
         )
         return bool(rows) and rows[0][0] != "undo"
 
+    def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
+        """The rating or skip that a rater gave last in a run, of those that hold; None if there is none."""
+        rows = self.rows(
+            "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
+            " JOIN clips c ON c.id = e.clip_id"
+            " WHERE e.rater_id = ?1 AND c.run = ?2 AND e.kind IN ('rate', 'skip') AND NOT EXISTS ("
+            "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
+            "  AND l.repeat = e.repeat AND l.id > e.id) ORDER BY e.id DESC LIMIT 1",
+            (rater_id, run),
+        )
+        for clip, repeat, value, first, after in rows:
+            return LastAnswer(clip, bool(repeat), value, _mark(first, after))
+        return None
+
     def answered(self, run: str, most: int = 400, *, rater_id: int | None = None) -> list[Answered]:
         """The last word of each rater on each of the clips of a run that were answered last, newest first.
 
@@ -216,7 +242,7 @@ class Answers(Database):
         """
         limit = as_of if as_of is not None else 2**62
         rows = self.stream(
-            "SELECT e.id, e.clip_id, c.demo_step, e.value, e.mark_start, e.mark_end"
+            "SELECT e.id, e.clip_id, c.demo_step, e.value, e.mark_from, e.mark_to"
             " FROM events e JOIN clips c ON c.id = e.clip_id"
             " WHERE c.run = ?1 AND e.kind = 'rate' AND e.repeat = 0 AND e.id <= ?2 AND NOT EXISTS ("
             "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
@@ -226,7 +252,7 @@ class Answers(Database):
             " ), '') != 'leave out' ORDER BY e.id",
             (run, limit),
         )
-        return [Rating._make(row) for row in rows]
+        return [Rating(*row[:4], mark=_mark(*row[4:])) for row in rows]
 
     def ratings_by_class(self, run: str | None = None) -> list[int]:
         """How many ratings of 1, 2, 3, 4 and 5 hold, in one run or in all."""
@@ -299,10 +325,15 @@ class Answers(Database):
     def restore_rating(self, row: Mapping[str, Any], rater_id: int) -> None:
         """Stores a rating of an export as it was: number, time and prediction."""
         with self.transaction() as db:
-            names = ("id", "clip_id", "value", "repeat", "mark_start", "mark_end", "snapshot", "predicted",
-                     "latency_ms", "created_at")  # fmt: skip
+            names = ("id", "clip_id", "value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
             db.execute(
-                f"INSERT INTO events (rater_id, kind, {', '.join(names)})"
-                f" VALUES (?, 'rate', {', '.join('?' * len(names))})",
-                (rater_id, *(row[name] for name in names)),
+                f"INSERT INTO events (rater_id, kind, {', '.join(names)}, mark_from, mark_to)"
+                f" SELECT :rater_id, 'rate', :{', :'.join(names)}, ROUND(:mark_start / r.step_seconds),"
+                " ROUND(:mark_end / r.step_seconds)"
+                " FROM clips c JOIN runs r ON r.id = c.run WHERE c.id = :clip_id",
+                {**row, "rater_id": rater_id},
             )
+
+
+def _mark(first: int | None, after: int | None) -> tuple[int, int] | None:
+    return None if first is None or after is None else (first, after)

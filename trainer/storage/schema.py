@@ -319,6 +319,44 @@ STEPS: tuple[str, ...] = (
     CREATE TRIGGER audit_keep_delete BEFORE DELETE ON audit
         BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END;
     """,
+    # 6: marks in control steps, worked out once from the seconds of earlier ratings (mark_start, mark_end:
+    # they stay as they were written, and nothing writes or reads them any more); the view gives seconds as
+    # before. What a rater said last is found by index, so that undo can ask for it.
+    """
+    ALTER TABLE runs ADD COLUMN step_seconds REAL NOT NULL DEFAULT 0.008;  -- of a control step
+    ALTER TABLE events ADD COLUMN mark_from INTEGER CHECK (mark_from >= 0);  -- first marked step of the clip
+    ALTER TABLE events ADD COLUMN mark_to INTEGER  -- the step after the last marked one
+        CHECK ((mark_from IS NULL) = (mark_to IS NULL))
+        CHECK (mark_from IS NULL OR (kind = 'rate' AND mark_from < mark_to));
+    DROP TRIGGER events_keep_update;
+    UPDATE events SET mark_from = MIN(steps - 1, CAST(ROUND(mark_start / 0.008) AS INTEGER)),
+                      mark_to = MIN(steps, MAX(MIN(steps - 1, CAST(ROUND(mark_start / 0.008) AS INTEGER)) + 1,
+                                               CAST(ROUND(mark_end / 0.008) AS INTEGER)))
+        FROM clips WHERE clips.id = events.clip_id AND mark_start IS NOT NULL;
+    CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
+        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
+    CREATE INDEX events_by_rater ON events (rater_id, id);
+    CREATE INDEX comparisons_by_rater ON comparisons (rater_id, id);
+    DROP VIEW ratings;
+    CREATE VIEW ratings AS
+        SELECT e.id, e.clip_id, c.run, r.demo, p.name AS rater, e.value, c.stage, c.iteration,
+               e.created_at, e.latency_ms, e.snapshot, e.predicted, c.demo_step, c.steps,
+               e.repeat, ROUND(e.mark_from * r.step_seconds, 6) AS mark_start,
+               ROUND(e.mark_to * r.step_seconds, 6) AS mark_end, c.choice, c.score,
+               COALESCE((
+                   SELECT o.kind = 'leave out' FROM events o
+                   WHERE o.clip_id IS NULL AND o.run = c.run AND o.rater_id = e.rater_id
+                   ORDER BY o.id DESC LIMIT 1
+               ), 0) AS left_out
+        FROM events e
+        JOIN clips c ON c.id = e.clip_id
+        JOIN runs r ON r.id = c.run
+        JOIN raters p ON p.id = e.rater_id
+        WHERE e.kind = 'rate' AND NOT EXISTS (
+            SELECT 1 FROM events l
+            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
+        );
+    """,
 )
 
 

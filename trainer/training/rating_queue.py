@@ -88,7 +88,7 @@ class Asking:
         if self._simulated is not None:
             # A process before this one may have died between its questions and the answers.
             asked = [c for s in ("cut", "ready") for c in self._store.waiting_clips(self._run, s)]
-            self._answer(self._simulated, learner, asked, [self._store.segment(c.id) for c in asked])
+            self._answer(self._simulated, asked, [self._store.segment(c.id) for c in asked])
         while self._fill_once(learner, pool, snapshot):
             if self._declined >= _MOST_DECLINED:
                 if learner.iteration == 0 and self._simulated is not None:
@@ -149,7 +149,7 @@ class Asking:
         if self.clips is not None:
             self.clips.submit(clips)
         return self._simulated is not None and self._answer(
-            self._simulated, learner, clips, [clip.segment for clip in new]
+            self._simulated, clips, [clip.segment for clip in new]
         )
 
     def _missing(self, learner: Learner, snapshot: Snapshot | None) -> int:
@@ -161,17 +161,14 @@ class Asking:
         queue = min(self._config.ratings.queue, self.target - given)
         return queue - len(waiting) if len(waiting) <= _FULL * queue else 0
 
-    def _answer(
-        self, simulated: Simulated, learner: Learner, clips: list[Clip], segments: list[Segment]
-    ) -> bool:
+    def _answer(self, simulated: Simulated, clips: list[Clip], segments: list[Segment]) -> bool:
         """Has clips rated by the simulated rater; whether it declined any."""
         rater, declined = self._store.ensure_rater(simulated.name, "simulated"), False
         for clip, segment in zip(clips, segments, strict=True):
             value = simulated.rate(segment, clip.demo_step)
             if value is not None:
                 mark = simulated.mark(segment, clip.demo_step) if simulated.mark else None
-                seconds = (mark[0] * learner.dt, mark[1] * learner.dt) if mark else None
-                self._store.rate(clip.id, rater.id, value, latency_ms=0, mark=seconds)
+                self._store.rate(clip.id, rater.id, value, latency_ms=0, mark=mark)
                 self._declined = 0
                 continue
             self._store.skip(clip.id, rater.id, latency_ms=0)

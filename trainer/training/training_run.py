@@ -101,7 +101,7 @@ class TrainingRun:
         if renderer is not None:
             self._gallery = Gallery(self.files.rollouts, demo, self.dt, renderer)
         self._pairing: Pairing | None = None
-        self._training_set = TrainingSet(store, run, self.dt)
+        self._training_set = TrainingSet(store, run)
         self._fitted_event = 0
         self._pool: Rollouts | None = None
         self._policy: PolicySnapshot | None = None

@@ -66,9 +66,12 @@ def make(version: int, file: Path) -> None:
         put("INSERT INTO snapshots VALUES ('hop-1', 1, 4, 2, '{\"loss\": 0.5}', ?)", (AT,))
         put("INSERT INTO iterations VALUES ('hop-1', 1, 1, 16000, '{\"predicted\": 2.0}', ?)", (AT,))
         if version >= 3:
-            put("INSERT INTO events (clip_id, rater_id, kind, value, repeat, mark_start, mark_end,"
+            start, end, *mark = (
+                ("mark_from", "mark_to", 1, 3) if version >= 6 else ("mark_start", "mark_end", 0.1, 0.2)
+            )
+            put(f"INSERT INTO events (clip_id, rater_id, kind, value, repeat, {start}, {end},"
                 " snapshot, latency_ms, created_at)"
-                " VALUES (1, 2, 'rate', 4, 1, 0.1, 0.2, 1, 800, ?)", (AT,))  # fmt: skip
+                " VALUES (1, 2, 'rate', 4, 1, ?, ?, 1, 800, ?)", (*mark, AT))  # fmt: skip
             put("INSERT INTO events (clip_id, rater_id, kind, reason, snapshot, latency_ms, created_at)"
                 " VALUES (5, 2, 'skip', 'too dark', 1, 700, ?)", (AT,))  # fmt: skip
             put("INSERT INTO events (rater_id, kind, snapshot, latency_ms, run, by_id, created_at)"

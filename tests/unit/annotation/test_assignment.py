@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import sqlite3
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from onedemo.config import RatingsConfig, RunConfig
 from onedemo.storage.ratings import Answered
 from onedemo.storage.store import NewClip, Store
 from onedemo.training.rating_queue import Asking
-from onedemo.types import Segment
+from onedemo.types import Demo, Segment
 
 
 def test_the_first_free_clip_is_leased_and_stays_with_its_page():
@@ -86,6 +88,9 @@ def add_clips(store, count):
     return [clip.id for clip in clips]
 
 
+DEMO = Demo(name="d", sha256="0", path=Path(), fps=100.0, frames=240, width=9, height=9)
+
+
 class Clock:
     def __init__(self):
         self.now = 10.0
@@ -102,7 +107,7 @@ def clock():
 def make_desk(store, clock, name="bo", assignment=None, **more):
     assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
     rater = store.ensure_rater(name, "annotator")
-    return Desk(store, "r", rater, assignment, name, dt=0.01, fps=100.0, frames=240, clock=clock, **more)
+    return Desk(store, "r", rater, assignment, name, dt=0.01, demo=DEMO, clock=clock, **more)
 
 
 @pytest.fixture
@@ -135,11 +140,13 @@ def test_undo_brings_clips_back_one_by_one(desk, store, clock):
     for clip in (1, 2):
         clock.now += 1
         desk.rate(clip, 5)
-    assert desk.undo()
+    assert not desk.undo(1)  # not the last one
+    assert desk.undoable == 2 and desk.undo(2)
     assert (desk.current, desk.upcoming) == (2, 3)
-    assert desk.undo()
+    assert not desk.undo(2)  # sent twice
+    assert desk.undo(1)
     assert desk.current == 1
-    assert not desk.undo()
+    assert desk.undoable is None and not desk.undo(1)
     clock.now += 1
     assert desk.rate(1, 2)
     assert (desk.current, desk.upcoming) == (2, 3)
@@ -151,8 +158,17 @@ def test_skip_moves_on_without_a_rating(desk, store, clock):
     assert desk.skip(1)
     assert desk.current == 2
     assert store.ratings_by_class() == [0] * 5
-    assert desk.undo()
-    assert desk.current == 1
+    assert desk.undo(1)
+    assert desk.current == 1 and desk.taken_back.value is None
+
+
+def test_how_soon_a_press_may_come_is_a_setting(store, clock):
+    desk = make_desk(store, clock, guard_seconds=0.05)
+    add_clips(store, 2)
+    desk.refill()
+    assert not desk.rate(1, 4)
+    clock.now += 0.06
+    assert desk.rate(1, 4)
 
 
 def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatch):
@@ -192,25 +208,24 @@ def test_two_raters_never_see_the_same_clip(store, clock):
     desks[0].close()
 
 
-def test_a_mark_goes_with_the_rating_of_its_clip_alone(desk, store, clock):
+def test_a_mark_is_of_the_clip_that_is_rated_and_comes_back_when_it_is_taken_back(desk, store, clock):
     clock.now += 1
-    assert not desk.set_mark(2, (0, 1))  # not on screen
-    assert desk.set_mark(1, (0.0, 2.0)) and desk.mark == (0, 2)
-    for mark in ((2, 1), (2, 9), (-1, 2), (float("nan"), 1), (0, float("nan"))):
+    for mark in ((2, 1), (2, 9), (-1, 2)):
         with pytest.raises(ValueError, match="3 pictures"):
-            desk.set_mark(1, mark)
-    assert desk.mark == (0, 2)
-    desk.rate(1, 2)
+            desk.rate(1, 2, mark)
+    assert desk.current == 1
+    assert desk.rate(1, 2, (0, 2)) and desk.mark is None
     clock.now += 1
-    desk.set_mark(2, (1, 3))
-    desk.set_mark(2, None)
-    desk.rate(2, 3)
-    assert [row[15:17] for row in store.iter_ratings()] == [(0.0, 0.02), (None, None)]
+    assert desk.rate(2, 3)
+    assert [row[15:17] for row in store.iter_ratings()] == [(0.0, 0.016), (None, None)]
+    assert desk.undo(2) and desk.mark is None
+    assert desk.undo(1) and desk.mark == (0, 2)
 
 
 def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clock):
     clock.now += 1
     desk.skip(1)
+    assert not desk.skip(2) and desk.skipped == 1  # too soon
     assert not desk.explain(2, "dark") and desk.explain(1, "dark") and not desk.explain(1, "again")
     assert desk.explained
     clock.now += 1
@@ -224,17 +239,27 @@ def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clo
     ]  # fmt: skip
 
 
-def test_a_page_that_is_loaded_again_can_take_back_what_was_rated_before(store, clock):
-    add_clips(store, 3)
-    done = []
-    first = make_desk(store, clock, done=done)
+def test_what_was_rated_may_be_taken_back_at_another_page_and_after_a_restart(store, clock):
+    add_clips(store, 4)
+    first = make_desk(store, clock)
     first.refill()
-    clock.now += 1
-    first.rate(1, 5)
+    for clip in (1, 2):
+        clock.now += 1
+        first.rate(clip, 5, (0, 1))
     first.close()
-    again = make_desk(store, clock, done=done)
+    other = make_desk(store, clock, "cy")
+    other.refill()
+    assert other.undoable is None and not other.undo(2)  # what others said stays
+    again = make_desk(store, clock)
     again.refill()
-    assert again.current == 2 and again.undo() and again.current == 1 and not again.can_undo
+    assert again.current == 3 and again.undo(2) and (again.current, again.upcoming) == (2, 3)
+    assert again.mark == (0, 1) and again.taken_back.value == 5
+    with closing(Store(store.path.parent)) as later:
+        restarted = make_desk(later, clock)
+        restarted.refill()
+        assert restarted.undoable == 1 and restarted.undo(1)
+        assert restarted.undoable is None
+    assert store.ratings_by_class() == [0] * 5
 
 
 class Always:
@@ -281,7 +306,7 @@ def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
     assert desk.rate(1, 2)
     rows = [(row[1], row[5], row[14]) for row in store.iter_ratings()]
     assert rows[0] == (1, 4, 0) and rows[-1] == (1, 2, 1)
-    assert desk.undo() and desk.current == 1
+    assert desk.undoable == 1 and desk.undo(1) and desk.current == 1
     assert [(row[1], row[5], row[14]) for row in store.iter_ratings()] == rows[:-1]
 
 

@@ -89,7 +89,7 @@ def test_imported_into_an_empty_directory_it_gives_the_same_predictor(study, tmp
             config = load_config(directory / "runs" / "first" / "config.toml")
             learner = Learner(config, demo.frames, demo.fps)
             learner.look_at(np.eye(demo.frames, 64, dtype=np.float32), None)
-            rated = TrainingSet(store, "first", learner.dt).at(store.last_event())
+            rated = TrainingSet(store, "first").at(store.last_event())
             fitted.append((rated, learner.fit(rated, 7)[0].tensors()))
     (one, tensors), (other, same) = fitted
     assert [(r.event, r.value, r.mark) for r in one] == [(r.event, r.value, r.mark) for r in other]

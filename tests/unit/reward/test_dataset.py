@@ -55,7 +55,7 @@ def test_bytes_that_are_no_segment(data):
 
 
 def test_a_segment_is_read_once_and_kept_in_float32(store, reads):
-    training_set = TrainingSet(store, "r", 0.008)
+    training_set = TrainingSet(store, "r")
     first = store.rate(3, 1, 4, latency_ms=1)
     (rated,) = training_set.at(first)
     assert (rated.event, rated.demo_step, rated.value) == (first, 2, 4)
@@ -69,7 +69,7 @@ def test_a_segment_is_read_once_and_kept_in_float32(store, reads):
 
 
 def test_a_rating_taken_back_is_in_no_later_set_but_in_the_earlier_ones(store, reads):
-    training_set = TrainingSet(store, "r", 0.008)
+    training_set = TrainingSet(store, "r")
     before = [store.rate(clip, 1, clip % 5 + 1, latency_ms=1) for clip in (1, 2, 3)][-1]
     assert [r.value for r in training_set.at(before)] == [2, 3, 4]
     after = store.undo(2, 1)
@@ -81,7 +81,7 @@ def test_a_rating_taken_back_is_in_no_later_set_but_in_the_earlier_ones(store, r
 
 def test_the_set_is_the_stores_whatever_was_asked_before(store):
     rng = np.random.default_rng(0)
-    training_set, events = TrainingSet(store, "r", 0.008), [0]
+    training_set, events = TrainingSet(store, "r"), [0]
     for _ in range(300):
         clip, rater = int(rng.integers(1, 13)), int(rng.integers(1, 3))
         try:
@@ -93,7 +93,7 @@ def test_the_set_is_the_stores_whatever_was_asked_before(store):
             continue
         as_of = events[int(rng.integers(len(events)))] if rng.random() < 0.3 else events[-1]
         kept = training_set.at(as_of)
-        fresh = TrainingSet(store, "r", 0.008).at(as_of)
+        fresh = TrainingSet(store, "r").at(as_of)
         wanted = store.ratings_as_of("r", as_of=as_of)
         assert [(r.event, r.demo_step, r.value) for r in kept] == [
             (w.event, w.demo_step, w.value) for w in wanted
@@ -110,5 +110,5 @@ def test_another_runs_ratings_stay_out(store):
         "other", [NewClip(demo_step=0, segment=segment(0), stage="online", iteration=1)]
     )
     event = store.rate(clip.id, 1, 5, latency_ms=1)
-    assert TrainingSet(store, "r", 0.008).at(event) == []
-    assert [r.value for r in TrainingSet(store, "other", 0.008).at(event)] == [5]
+    assert TrainingSet(store, "r").at(event) == []
+    assert [r.value for r in TrainingSet(store, "other").at(event)] == [5]

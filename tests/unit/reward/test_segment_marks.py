@@ -9,9 +9,15 @@ import pytest
 from onedemo.annotators.base import Judge
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.reward.dataset import TrainingSet
-from onedemo.reward.segment_marks import marked_steps, seconds_of_pictures, split_marks
+from onedemo.reward.segment_marks import (
+    marked_steps,
+    picture_of_step,
+    pictures_of_steps,
+    split_marks,
+    steps_of_pictures,
+)
 from onedemo.storage.store import NewClip, RatedSegment, Store
-from onedemo.types import Segment
+from onedemo.types import Demo, Segment
 
 W = 20
 
@@ -63,6 +69,7 @@ def test_the_best_stays_the_best_and_a_mark_of_everything_says_nothing():
 def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
     """Wherever the clip begins, through the database and back, as what learns sees it."""
     dt, steps, frames = 0.008, 38, int(8 * fps)
+    demo = Demo(name="d", sha256="0", path=tmp_path, fps=fps, frames=frames, width=9, height=9)
     with closing(Store(tmp_path)) as store:
         store.rows("PRAGMA synchronous = OFF")
         store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
@@ -75,19 +82,21 @@ def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
             for i, j in ((0, 1), (2, 5), (len(pictures) - 1, len(pictures)), (0, len(pictures))):
                 clip = NewClip(demo_step=demo_step, segment=Segment(**zeros), stage="online", iteration=1)
                 (clip,) = store.add_clips("r", [clip])
-                mark = seconds_of_pictures((i, j), demo_step, steps, dt=dt, fps=fps, frames=frames)
+                of_step = picture_of_step(clip, dt, demo)
+                mark = steps_of_pictures((i, j), of_step)
+                assert pictures_of_steps(mark, of_step) == (i, j)
                 store.rate(clip.id, rater, 2, 900, mark=mark)
                 expected.append(np.isin(shown, pictures[i:j]))
-        ratings = TrainingSet(store, "r", dt).at(store.last_event())
+        ratings = TrainingSet(store, "r").at(store.last_event())
         assert len(ratings) == len(expected) == 28
         for rating, inside in zip(ratings, expected, strict=True):
             assert np.array_equal(marked_steps(rating) > 0, inside)
 
 
-@pytest.mark.parametrize("mark", [(0, 0), (3, 1), (-1, 2), (0, 99), (0.5, 2), (0, float("nan"))])
+@pytest.mark.parametrize("mark", [(0, 0), (3, 1), (-1, 2), (0, 11)])
 def test_what_is_no_stretch_of_pictures_is_no_mark(mark):
     with pytest.raises(ValueError, match="10 pictures"):
-        seconds_of_pictures(mark, 0, 41, dt=0.008, fps=30.0, frames=240)
+        steps_of_pictures(mark, np.repeat(np.arange(10), 4))
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ class Clock:
 def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo, cy = (
-        PairDesk(store, "r", store.ensure_rater(name, "annotator"), assignment, name, clock)
+        PairDesk(store, "r", store.ensure_rater(name, "annotator"), assignment, name, clock=clock)
         for name in ("bo", "cy")
     )
     bo.refill()
@@ -100,8 +100,10 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     assert bo.answer(pairs[0], "left") and bo.current == pairs[1] and bo.upcoming is None
     clock.now += 0.4
     assert bo.answer(pairs[1], "skip") and bo.current is None
-    assert bo.undo() and bo.current == pairs[1] and bo.undo() and bo.current == pairs[0]
-    assert bo.upcoming == pairs[1] and not bo.undo()
+    assert not bo.undo(pairs[0])  # not the last one
+    assert bo.undoable == pairs[1] and bo.undo(pairs[1]) and bo.current == pairs[1]
+    assert bo.undo(pairs[0]) and bo.current == pairs[0]
+    assert bo.upcoming == pairs[1] and bo.undoable is None and not bo.undo(pairs[0])
     clock.now += 0.4
     assert bo.answer(pairs[0], "right") and bo.current == pairs[1]
     cy.close()
@@ -112,16 +114,16 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
 def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo, cy = (store.ensure_rater(name, "annotator") for name in ("bo", "cy"))
-    gone = PairDesk(store, "r", bo, assignment, 1, clock)
+    gone = PairDesk(store, "r", bo, assignment, 1, clock=clock)
     gone.refill()  # and its line breaks without a word
-    back = PairDesk(store, "r", bo, assignment, 2, clock)
-    other = PairDesk(store, "r", cy, assignment, 3, clock)
+    back = PairDesk(store, "r", bo, assignment, 2, clock=clock)
+    other = PairDesk(store, "r", cy, assignment, 3, clock=clock)
     other.refill()
     assert (other.current, other.upcoming) == (pairs[2], pairs[3])
     back.refill()
     assert (back.current, back.upcoming) == (pairs[0], pairs[1])
     clock.now += 200
-    late = PairDesk(store, "r", store.ensure_rater("di", "annotator"), assignment, 4, clock)
+    late = PairDesk(store, "r", store.ensure_rater("di", "annotator"), assignment, 4, clock=clock)
     late.refill()
     assert (late.current, late.upcoming) == (pairs[0], pairs[1])  # the leases have ended
     assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
@@ -130,7 +132,7 @@ def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_aga
 def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo = store.ensure_rater("bo", "annotator")
-    laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock) for page in ("laptop", "phone"))
+    laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock=clock) for page in ("laptop", "phone"))
     laptop.refill()
     clock.now += 121  # the lease has ended
     phone.refill()
@@ -139,7 +141,7 @@ def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(s
     with pytest.raises(AnsweredElsewhere, match="at another page of yours"):
         laptop.answer(pairs[0], "right")
     moved_to = laptop.current
-    assert moved_to not in (None, pairs[0]) and not laptop.can_undo
+    assert moved_to not in (None, pairs[0]) and laptop.undoable == pairs[0]
     clock.now += 1
     assert laptop.answer(moved_to, "equal")
     assert [(row[1], row[5]) for row in store.iter_comparisons()] == [(pairs[0], "left"), (moved_to, "equal")]

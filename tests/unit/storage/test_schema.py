@@ -79,6 +79,8 @@ def test_what_was_said_is_read_and_said_on(old, version):
         expected = [(1, "bo", 5), (1, "ada", 4), (2, "bo", 2), (4, "oracle", 3)]
         assert sorted(held) == sorted(expected + ([(1, "bo", 4)] if version >= 3 else []))
         assert sum(store.ratings_by_class("hop-1")) == 4  # second opinions are not counted
+        marks = store.rows("SELECT mark_from, mark_to FROM events WHERE mark_from IS NOT NULL")
+        assert marks == ([] if version < 3 else [(3, 4)] if version < 6 else [(1, 3)])
         assert [clip.id for clip in store.waiting_clips("hop-1")] == [5, 6] if version < 3 else [6]
         for number in range(1, 7):
             wanted, there = make.segment(number), store.segment(number)
@@ -91,6 +93,30 @@ def test_what_was_said_is_read_and_said_on(old, version):
         store.undo(1, bo.id)
         assert store.last_event() == event + 1
         assert sum(store.ratings_by_class("hop-1")) == 4
+
+
+def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_path):
+    file = tmp_path / FILE_NAME
+    shutil.copy(STORED / "v5.sqlite3", file)
+    marks = [(first, after) for first in range(0, 40, 3) for after in range(first + 1, 42, 4)]
+    with closing(sqlite3.connect(file)) as db, db:
+        for number, (first, after) in enumerate(marks, start=100):
+            db.execute(
+                "INSERT INTO clips (id, run, demo_step, steps, stage, iteration, snapshot, created_at)"
+                " VALUES (?, 'hop-1', 5, 41, 'online', 1, 1, '')",
+                (number,),
+            )
+            db.execute(
+                "INSERT INTO events (clip_id, rater_id, kind, value, mark_start, mark_end, snapshot,"
+                " latency_ms, created_at) VALUES (?, 2, 'rate', 2, ?, ?, 1, 900, '')",
+                (number, round(first * 0.008, 6), round(after * 0.008, 6)),
+            )
+    with closing(Store(tmp_path)) as store:
+        assert [r.mark for r in store.ratings_as_of("hop-1") if r.clip >= 100] == marks
+        seconds = [(row[15], row[16]) for row in store.iter_ratings() if row[1] >= 100]
+        assert seconds == [(round(first * 0.008, 6), round(after * 0.008, 6)) for first, after in marks]
+        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
+            store.rows("UPDATE events SET mark_from = 0")
 
 
 def test_a_newer_database_is_refused_and_not_touched(tmp_path):

@@ -1,0 +1,68 @@
+"""What a browser may say of a clip; and the way through the practice clips."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from onedemo.app.annotation import presses
+from onedemo.app.annotation.presses import read_press
+from onedemo.app.annotation.tutorial import Lesson
+
+PAGE = {"page": "p", "id": "1"}
+RATE = PAGE | {"press": "rate", "clip": 7, "value": 3}
+REASON = PAGE | {"press": "reason", "clip": 7, "reason": "too dark"}
+PRACTISE = PAGE | {"press": "practise", "exercise": 0, "do": 4}
+
+
+def read(body):
+    return read_press(json.dumps(body).encode())
+
+
+def test_every_kind_of_press_is_read():
+    assert read(RATE | {"mark": [0, 3]}) == presses.Rate(page="p", id="1", clip=7, value=3, mark=(0, 3))
+    assert read(RATE | {"mark": None}) == presses.Rate(page="p", id="1", clip=7, value=3)
+    assert read(REASON) == presses.Explain(page="p", id="1", clip=7, reason="too dark")
+    assert read(PRACTISE).do == 4 and read(PRACTISE | {"do": "next"}).do == "next"
+    for kind in ("skip", "undo"):
+        assert read(PAGE | {"press": kind, "clip": 7}).clip == 7
+    assert read(PAGE | {"press": "compare", "pair": 7, "answer": "equal"}).answer == "equal"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {}, [], "x", None, RATE | {"more": 1}, RATE | {"clip": "7"}, RATE | {"clip": True},
+        RATE | {"clip": 0},
+        RATE | {"clip": 2**53}, RATE | {"value": 0}, RATE | {"value": 6}, RATE | {"value": 2.5},
+        RATE | {"mark": [1]}, RATE | {"mark": ["0", "1"]}, RATE | {"mark": [0.5, 1]},
+        RATE | {"mark": [-1, 2]},
+        RATE | {"page": ""}, RATE | {"page": "x" * 65}, RATE | {"id": 5}, RATE | {"press": "leave out"},
+        {key: value for key, value in RATE.items() if key != "page"},
+        REASON | {"reason": 7}, REASON | {"reason": " "}, REASON | {"reason": "a\nb"},
+        REASON | {"reason": "x" * 201}, PRACTISE | {"do": "x"}, PRACTISE | {"exercise": -1},
+        PAGE | {"press": "compare", "pair": 7, "answer": "both"},
+    ],
+)  # fmt: skip
+def test_anything_else_is_refused(body):
+    with pytest.raises(ValueError):
+        read(body)
+
+
+@pytest.mark.parametrize("body", [b"", b"\xff", b"[" * 5000, b'{"clip": 1e999}'])
+def test_what_is_no_json_is_refused(body):
+    with pytest.raises(ValueError):
+        read_press(body)
+
+
+def test_the_practice_is_gone_through_by_presses_that_name_the_exercise():
+    lesson = Lesson()
+    assert not lesson.take(0, "next") and not lesson.take(1, 3)
+    assert lesson.take(0, 5) and lesson.answer == 5
+    assert not lesson.take(0, 4)  # once
+    assert lesson.take(0, "next") and not lesson.take(0, "next")
+    assert lesson.take(1, 1) and lesson.take(1, "next") and lesson.over
+    assert not lesson.take(2, 1)
+    lesson.begin()
+    assert not lesson.over and lesson.take(0, "leave") and lesson.over
