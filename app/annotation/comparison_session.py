@@ -71,13 +71,13 @@ class PairDesk:
             seconds = self._clock() - self._shown_at
             if pair != self.current or seconds < GUARD_SECONDS:
                 return False
-            if self._store.compared(pair, self._rater.id):
+            if self._store.comparisons.holds(pair, self._rater.id):
                 self._assignment.release(self._holder, pair)
                 self._advance()
                 raise AnsweredElsewhere(
                     "You had compared that pair at another page of yours: that answer stands."
                 )
-            self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
+            self._store.comparisons.compare(pair, self._rater.id, answer, round(1000 * seconds))
             self._done.append(pair)
             self._assignment.release(self._holder, pair)
             self._advance()
@@ -92,7 +92,7 @@ class PairDesk:
         with self._lock:
             if not self._done:
                 return False
-            self._store.compare(self._done[-1], self._rater.id, "undo", 0)
+            self._store.comparisons.compare(self._done[-1], self._rater.id, "undo", 0)
             pair = self._done.pop()
             if self.upcoming is not None and self.current is not None:
                 self._assignment.release(self._holder, self.upcoming)
@@ -111,7 +111,9 @@ class PairDesk:
         self.upcoming = self._pick() if self.current is not None else None
 
     def _pick(self, only: int | None = None) -> int | None:
-        waiting = [pair.id for pair in self._store.waiting_pairs(self._run) if only in (None, pair.id)]
+        waiting = [
+            pair.id for pair in self._store.comparisons.waiting_pairs(self._run) if only in (None, pair.id)
+        ]
         avoid = () if self.current is None else (self.current,)
         return self._assignment.take(self._holder, waiting, now=self._clock(), avoid=avoid)
 

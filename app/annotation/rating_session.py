@@ -125,7 +125,9 @@ class Desk:
             if ask is None:
                 return False
             seconds = self._seconds(clip, self.mark) if self.mark is not None else None
-            self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=seconds, repeat=ask.repeat)
+            self._store.ratings.rate(
+                clip, self.rater.id, value, self._latency_ms(), mark=seconds, repeat=ask.repeat
+            )
             self._leave(replace(ask, mark=self.mark, value=value))
             return True
 
@@ -135,7 +137,7 @@ class Desk:
             ask = self._accepted(clip)
             if ask is None:
                 return False
-            self._store.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
+            self._store.ratings.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
             self._leave(ask)
             self.skipped = clip
             return True
@@ -150,7 +152,7 @@ class Desk:
         with self._lock:
             if clip != self.skipped:
                 return False
-            self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._done[-1].repeat)
+            self._store.ratings.skip(clip, self.rater.id, 0, reason=reason, repeat=self._done[-1].repeat)
             self.skipped, self.explained = None, True
             return True
 
@@ -174,7 +176,7 @@ class Desk:
             return True
 
     def _seconds(self, clip: int, mark: Mark) -> tuple[float, float]:
-        shown = self._store.clip(clip)
+        shown = self._store.clips.get(clip)
         if shown is None:
             raise ValueError(f"no clip {clip}")
         return seconds_of_pictures(
@@ -194,7 +196,7 @@ class Desk:
             if not self._done:
                 return False
             ask = self._done[-1]
-            self._store.undo(ask.clip, self.rater.id, repeat=ask.repeat)
+            self._store.ratings.undo(ask.clip, self.rater.id, repeat=ask.repeat)
             self._done.pop()
             if self._upcoming is not None and self._current is not None:
                 self._assignment.release(self._holder, self._upcoming.clip)
@@ -211,7 +213,7 @@ class Desk:
     def _accepted(self, clip: int) -> Ask | None:
         in_time = self._clock() - self._shown_at >= GUARD_SECONDS
         ask = self._current if clip == self.current and in_time else None
-        if ask is not None and self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat):
+        if ask is not None and self._store.ratings.holds(ask.clip, self.rater.id, repeat=ask.repeat):
             self._assignment.release(self._holder, ask.clip)
             self._advance()
             raise AnsweredElsewhere("You had rated that clip at another page of yours: that answer stands.")
@@ -239,7 +241,7 @@ class Desk:
         asked = (
             ask.clip in waiting
             if ask.kind == "fresh"
-            else not self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat)
+            else not self._store.ratings.holds(ask.clip, self.rater.id, repeat=ask.repeat)
         )
         return asked and self._take([ask.clip]) is not None
 
@@ -252,18 +254,18 @@ class Desk:
             return None
         if self._kind != "fresh":
             kind, self._kind = self._kind, "fresh"
-            mine = self._store.answered(self._run, rater_id=self.rater.id)
+            mine = self._store.ratings.answered(self._run, rater_id=self.rater.id)
             if kind == "repeated":
                 clip = self._take(to_repeat(mine, self.rater.id))
             else:
-                clip = self._take(to_share([*mine, *self._store.answered(self._run)], self.rater.id))
+                clip = self._take(to_share([*mine, *self._store.ratings.answered(self._run)], self.rater.id))
             if clip is not None:
                 return Ask(clip, kind)
         clip = self._take(waiting)
         return Ask(clip) if clip is not None else None
 
     def _waiting(self) -> list[int]:
-        return [clip.id for clip in self._store.waiting_clips(self._run)]
+        return [clip.id for clip in self._store.clips.waiting(self._run)]
 
     def _take(self, clips: list[int]) -> int | None:
         avoid = () if self._current is None else (self._current.clip,)

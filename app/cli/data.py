@@ -57,7 +57,7 @@ def _export(arguments: argparse.Namespace) -> None:
     from onedemo.storage.ratings import SKIP_COLUMNS
 
     with open_store(arguments, must_exist=True) as store:
-        run, runs = arguments.run_name, [entry["id"] for entry in store.runs()]
+        run, runs = arguments.run_name, [entry["id"] for entry in store.runs.all()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
         others = (arguments.segments, arguments.comparisons, arguments.skips, arguments.card)
@@ -69,10 +69,10 @@ def _export(arguments: argparse.Namespace) -> None:
         if arguments.card is not None:
             write_atomic(arguments.card, card(store, run).encode())
         if arguments.comparisons is not None:
-            write_atomic(arguments.comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
+            write_atomic(arguments.comparisons, csv_blocks(store.comparisons.stream(run), COMPARISON_COLUMNS))
         if arguments.skips is not None:
-            write_atomic(arguments.skips, csv_blocks(store.iter_skips(run), SKIP_COLUMNS))
-        blocks = csv_blocks(store.iter_ratings(run, rater=arguments.rater))
+            write_atomic(arguments.skips, csv_blocks(store.ratings.stream_skips(run), SKIP_COLUMNS))
+        blocks = csv_blocks(store.ratings.stream(run, rater=arguments.rater))
         if arguments.out is not None:
             write_atomic(arguments.out, blocks)
         elif not any(others):
@@ -96,7 +96,8 @@ def open_store(arguments: argparse.Namespace, must_exist: bool = False) -> Any:
     """
     from contextlib import closing
 
-    from onedemo.storage.store import FILE_NAME, Store
+    from onedemo.storage.database import FILE_NAME
+    from onedemo.storage.store import Store
 
     if must_exist and not (arguments.data_dir / FILE_NAME).exists():
         raise UserError(f"no {FILE_NAME} in {arguments.data_dir}; give the directory with --data-dir")

@@ -49,19 +49,19 @@ def _add(arguments: argparse.Namespace) -> None:
     name = check_person(arguments.name)
     lasts = read_span(arguments.expires) if arguments.expires is not None else None
     with open_store(arguments) as store:
-        rater = store.ensure_rater(name, "researcher" if arguments.researcher else "annotator")
+        rater = store.accounts.ensure(name, "researcher" if arguments.researcher else "annotator")
         if arguments.once or lasts is not None:
             link = passing_link(store, rater, arguments.url, once=arguments.once, lasts=lasts)
         else:
             link = issue_link(store, read_secret(arguments.data_dir), rater, arguments.url)
         kind = ("once" if arguments.once else "standing") + (f", {arguments.expires}" if lasts else "")
-        store.add_audit(COMMAND_LINE, "made a link", f"for {rater.name}, {rater.role} ({kind})")
+        store.audit.add(COMMAND_LINE, "made a link", f"for {rater.name}, {rater.role} ({kind})")
         print(link)
 
 
 def _list(arguments: argparse.Namespace) -> None:
     with open_store(arguments, must_exist=True) as store:
-        for rater in store.raters():
+        for rater in store.accounts.raters():
             print(f"{rater.name:24} {rater.role}")
 
 
@@ -72,7 +72,7 @@ def _links(arguments: argparse.Namespace) -> None:
             (str(link.id), link.rater.name, link.rater.role, link.state, "once" if link.once else "-",
              *(time[:16].replace("T", " ") if time else "-"
                for time in (link.created_at, link.expires_at, link.last_used_at)))
-            for link in store.links()
+            for link in store.accounts.links()
         ]  # fmt: skip
     widths = [max(len(row[column]) for row in (heads, *rows)) for column in range(len(heads))]
     for row in (heads, *rows):
@@ -84,15 +84,15 @@ def _revoke(arguments: argparse.Namespace) -> None:
         raise UserError("name the rater whose links are to end, or one link with --link N")
     with open_store(arguments, must_exist=True) as store:
         if arguments.link is not None:
-            link = store.revoke_link(arguments.link)
-            store.add_audit(COMMAND_LINE, "revoked a link", f"{link.id} of {link.rater.name}")
+            link = store.accounts.revoke_link(arguments.link)
+            store.audit.add(COMMAND_LINE, "revoked a link", f"{link.id} of {link.rater.name}")
             print(f"ended link {link.id} of {link.rater.name} and the pages opened with it; the ratings stay")
             return
-        raters = {rater.name: rater for rater in store.raters()}
+        raters = {rater.name: rater for rater in store.accounts.raters()}
         if arguments.name not in raters:
             raise UserError(f"no rater {arguments.name!r}; there are: {', '.join(raters) or 'none'}")
-        ended = store.revoke_tokens(raters[arguments.name].id)
-        store.add_audit(COMMAND_LINE, "revoked a rater", arguments.name)
+        ended = store.accounts.revoke_tokens(raters[arguments.name].id)
+        store.audit.add(COMMAND_LINE, "revoked a rater", arguments.name)
         print(f"ended {ended} links and sessions of {arguments.name}; the ratings stay")
 
 
@@ -104,7 +104,7 @@ def _audit(arguments: argparse.Namespace) -> None:
     with open_store(arguments, must_exist=True) as store:
         if arguments.csv is not None:
             check_output(arguments.csv, arguments.data_dir)
-            write_atomic(arguments.csv, csv_blocks(store.audit(), AUDIT_COLUMNS))
+            write_atomic(arguments.csv, csv_blocks(store.audit.lines(), AUDIT_COLUMNS))
             return
-        for at, who, what, detail in store.audit():
+        for at, who, what, detail in store.audit.lines():
             print(f"{at[:19].replace('T', ' ')}  {who:24} {what}{': ' if detail else ''}{detail}")

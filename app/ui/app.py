@@ -160,7 +160,7 @@ class Page:
 
     def _rater(self, rater_id: int) -> Rater | None:
         if rater_id not in self._raters:
-            self._raters = {rater.id: rater for rater in self.trainer.store.raters()}
+            self._raters = {rater.id: rater for rater in self.trainer.store.accounts.raters()}
         return self._raters.get(rater_id)
 
     def _tick(self) -> None:

@@ -71,7 +71,7 @@ class Compare(Pressing):
         self._desk.close()
 
     def _draw(self) -> None:
-        pair, count = self._desk.current, self._store.count_comparisons(self._run)
+        pair, count = self._desk.current, self._store.comparisons.count(self._run)
         with self._client.atomic():
             self._put(self._top, top_html(count))
             self._put(

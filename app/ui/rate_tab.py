@@ -97,14 +97,14 @@ class Rate(Pressing):
         """One press in the lesson; after the last, the first real clip."""
         moved = step()
         if self._lesson is None:
-            self._store.set_practised(self._session.rater.id)
+            self._store.accounts.set_practised(self._session.rater.id)
             self.desk.refill()
         return moved
 
     # Drawing
 
     def _draw(self) -> None:
-        count = self._store.count_learned(self._run)  # as many as the trainer counts
+        count = self._store.ratings.count_for_training(self._run)  # as many as the trainer counts
         with self._client.atomic():  # Clip and keys change together.
             if self._lesson is not None:
                 self._draw_lesson()

@@ -75,7 +75,7 @@ class Session:
         self.rater = rater
         self.dark = dark
         self.done = done
-        self.lesson = None if page.trainer.store.has_practised(rater.id) else Lesson()
+        self.lesson = None if page.trainer.store.accounts.has_practised(rater.id) else Lesson()
         """The practice clips, until they are done."""
         self._lock = threading.RLock()
         self._closed = False

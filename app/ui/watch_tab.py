@@ -104,15 +104,15 @@ class Watch:
                 return
             self._practised = status.iteration > 0
             store, run = self._trainer.store, self._trainer.run
-            nobody = nobody_html(sum(store.ratings_by_class(run)), store.count_learned(run))
+            nobody = nobody_html(sum(store.ratings.by_class(run)), store.ratings.count_for_training(run))
             self._put(self._strip, strip_html(status, time.monotonic() < self._confirm_until) + nobody)
-            new = self._trainer.store.iterations(self._trainer.run, after=self._charts.last)
+            new = self._trainer.store.runs.iterations(self._trainer.run, after=self._charts.last)
             self._charts.extend(new)
             if new:
                 self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
                 self._put(self._gallery, progress.gallery_html(self._charts.rows, self._version))
             self._put(
-                self._classes, charts.classes_html(self._trainer.store.ratings_by_class(self._trainer.run))
+                self._classes, charts.classes_html(self._trainer.store.ratings.by_class(self._trainer.run))
             )
 
     def close(self) -> None:
@@ -146,7 +146,7 @@ class Watch:
         self.refresh(self._trainer.status())
 
     def _log(self, what: str) -> None:
-        self._trainer.store.add_audit(self._session.rater.name, what, self._trainer.run)
+        self._trainer.store.audit.add(self._session.rater.name, what, self._trainer.run)
 
     # The robot
 

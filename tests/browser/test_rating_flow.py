@@ -17,7 +17,7 @@ def frame_of(page) -> int:
 
 
 def marks_of(site) -> list[tuple]:
-    return site.trainer.store.rows(
+    return site.trainer.store.database.rows(
         "SELECT clip_id, value, mark_start, mark_end FROM events WHERE kind = 'rate' ORDER BY id"
     )
 
@@ -27,7 +27,7 @@ def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromiu
     from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
-    new = store.ensure_rater("new", "annotator")
+    new = store.accounts.ensure("new", "annotator")
     link = issue_link(store, read_secret(store.path.parent), new, site.url)
     with opened(chromium, link, viewport) as page:
         page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
@@ -39,7 +39,9 @@ def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromiu
         assert not page.locator(".od-answers").is_visible()
         page.keyboard.press("Enter")
         page.wait_for_selector(".od-progress >> text=Practice 2 of 2")
-        page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)  # else a press is too early
+        page.wait_for_selector(
+            ".od-practice .od-player[data-frame]", timeout=60_000
+        )  # else a press is too early
         page.click('.od-answers [data-key="1"]')
         page.wait_for_selector(".od-feedback >> text=1 is right.")
         page.click("[data-go]")
@@ -197,7 +199,9 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
 @BOTH
 def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site, viewport):
     def reasons():
-        return site.trainer.store.rows("SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id")
+        return site.trainer.store.database.rows(
+            "SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id"
+        )
 
     with opened(chromium, site.links["annotator"], viewport) as page:
         shown_clip(page)

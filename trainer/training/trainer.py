@@ -272,7 +272,7 @@ class Trainer:
         # The networks that learn are too small to be split: threads would wait for each other more than
         # they compute, the longer the busier the machine. Their first weights depend on the number, too.
         torch.set_num_threads(1)
-        begun = bool(self.store.snapshots(self.run))
+        begun = bool(self.store.runs.snapshots(self.run))
         start = keep_start(self.files, self._start, begun=begun)
         first = Snapshot.load(start, self.config.device) if start is not None else None
         learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
@@ -343,7 +343,7 @@ class Trainer:
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
         left = self._asking.given() < self._asking.target
         save_checkpoint(self.files.checkpoint, learner.state_dict(), row, rollouts if left else None)
-        self.store.add_iteration(self.run, learner.iteration, **row)
+        self.store.runs.add_iteration(self.run, learner.iteration, **row)
         self._asking.withdraw_stale(learner.iteration)
         if self._watch is not None:
             self._watch(learner, snapshot)
@@ -351,7 +351,7 @@ class Trainer:
 
     def _refit(self, learner: Learner, at_least: int) -> bool:
         """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
-        event = self.store.last_event()
+        event = self.store.ratings.last_event()
         if event == self._fitted_event or event - self._fitted_event < at_least:
             return False
         ratings = self._training_set.at(event)
@@ -360,7 +360,9 @@ class Trainer:
         number = (self._snapshot.number if self._snapshot else 0) + 1
         snapshot, stats = learner.fit(ratings, number)
         snapshot.save(self.files.snapshot(number))
-        self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
+        self.store.runs.add_snapshot(
+            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats)
+        )
         self._snapshot, self._fitted_event = snapshot, event
         self._asking.predict_waiting(learner, snapshot)
         return True
@@ -419,7 +421,7 @@ class Trainer:
 
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds whole."""
-        for row in reversed(self.store.snapshots(self.run)):
+        for row in reversed(self.store.runs.snapshots(self.run)):
             file = self.files.snapshot(row["number"])
             if read_whole(file) is not None:
                 self._snapshot = Snapshot.load(file, self.config.device)
@@ -433,5 +435,5 @@ class Trainer:
         state, row, self._pool = saved
         learner.load_state_dict(state)
         # The process may have died between the file and the row.
-        self.store.add_iteration(self.run, learner.iteration, **row)
+        self.store.runs.add_iteration(self.run, learner.iteration, **row)
         return True

@@ -11,8 +11,10 @@ import pytest
 from helpers.server_process import Serving
 from onedemo.app.cli.main import _parser, main
 from onedemo.config import METHODS
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.ratings import RATING_COLUMNS
 from onedemo.storage.schema import STEPS as SCHEMA
-from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, Store
+from onedemo.storage.store import Store
 
 
 @pytest.mark.parametrize(
