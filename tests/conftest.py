@@ -116,8 +116,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     site = Site(trainer, page, front, url)
     secret = read_secret(tmp_path)
     for title, name in (("researcher", "ada"), ("annotator", "bo"), ("second annotator", "cy")):
-        rater = trainer.store.ensure_rater(name, title.split()[-1])
-        trainer.store.set_practised(rater.id)
+        rater = trainer.store.accounts.ensure(name, title.split()[-1])
+        trainer.store.accounts.set_practised(rater.id)
         site.links[title] = issue_link(trainer.store, secret, rater, url)
     yield site
     front.close()

@@ -23,8 +23,8 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from onedemo.errors import UserError
+from onedemo.storage.database import FILE_NAME
 from onedemo.storage.schema import check_version
-from onedemo.storage.store import FILE_NAME
 
 MANIFEST = "manifest.json"
 FORMAT = 1

@@ -20,9 +20,9 @@ from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos.library import list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
+from onedemo.storage.database import FILE_NAME
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_version
-from onedemo.storage.store import FILE_NAME
 from onedemo.vision.encoders import make_encoder
 
 _LITTLE_ROOM = 1 << 30

@@ -77,7 +77,7 @@ def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
     dt = vector_env.spec("hopper").dt
     columns = ("clip_id", "rater", "value", "repeat", "latency_ms", "predicted", "steps")
-    rows = store.newest_ratings(run, most, columns)
+    rows = store.ratings.newest(run, most, columns)
     return [
         RatingRow(clip, rater, value, bool(repeat), latency, predicted, 1000 * dt * steps)
         for clip, rater, value, repeat, latency, predicted, steps in rows

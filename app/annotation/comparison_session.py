@@ -46,7 +46,7 @@ class PairDesk:
     @property
     def undoable(self) -> int | None:
         """The pair whose answer may be taken back: the last one of this rater, at whatever page."""
-        return self._store.last_compared(self._run, self._rater.id)
+        return self._store.comparisons.last_compared(self._run, self._rater.id)
 
     def refill(self) -> bool:
         """Looks for pairs if none is on screen or at hand; returns whether anything changed."""
@@ -73,7 +73,7 @@ class PairDesk:
             if pair != self.current or seconds < self._guard_seconds:
                 return False
             try:
-                self._store.compare(pair, self._rater.id, answer, round(1000 * seconds))
+                self._store.comparisons.compare(pair, self._rater.id, answer, round(1000 * seconds))
             except AlreadyAnswered:
                 self._assignment.release(self._holder, pair)
                 self._advance()
@@ -91,9 +91,9 @@ class PairDesk:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            if pair != self._store.last_compared(self._run, self._rater.id):
+            if pair != self._store.comparisons.last_compared(self._run, self._rater.id):
                 return False
-            self._store.compare(pair, self._rater.id, "undo", 0)
+            self._store.comparisons.compare(pair, self._rater.id, "undo", 0)
             if self.upcoming is not None and self.current is not None:
                 self._assignment.release(self._holder, self.upcoming)
             self.upcoming = self.current or self.upcoming
@@ -111,7 +111,9 @@ class PairDesk:
         self.upcoming = self._pick() if self.current is not None else None
 
     def _pick(self, only: int | None = None) -> int | None:
-        waiting = [pair.id for pair in self._store.waiting_pairs(self._run) if only in (None, pair.id)]
+        waiting = [
+            pair.id for pair in self._store.comparisons.waiting_pairs(self._run) if only in (None, pair.id)
+        ]
         avoid = () if self.current is None else (self.current,)
         return self._assignment.take(self._holder, waiting, now=self._clock(), avoid=avoid)
 

@@ -96,7 +96,7 @@ class Desk:
     @property
     def undoable(self) -> int | None:
         """The clip whose rating or skip may be taken back: the last one of this rater, at whatever page."""
-        last = self._store.last_answer(self._run, self.rater.id)
+        last = self._store.ratings.last_answer(self._run, self.rater.id)
         return last.clip if last else None
 
     @property
@@ -134,7 +134,9 @@ class Desk:
 
         def commit(ask: Ask) -> None:
             steps = steps_of_pictures(mark, self._pictures(clip)) if mark is not None else None
-            self._store.rate(clip, self.rater.id, value, self._latency_ms(), mark=steps, repeat=ask.repeat)
+            self._store.ratings.rate(
+                clip, self.rater.id, value, self._latency_ms(), mark=steps, repeat=ask.repeat
+            )
 
         return self._answer(clip, commit) is not None
 
@@ -142,7 +144,7 @@ class Desk:
         """As ``rate``, but without a rating. ``explain`` may follow."""
 
         def commit(ask: Ask) -> None:
-            self._store.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
+            self._store.ratings.skip(clip, self.rater.id, self._latency_ms(), repeat=ask.repeat)
 
         with self._lock:
             ask = self._answer(clip, commit)
@@ -160,7 +162,7 @@ class Desk:
         with self._lock:
             if self._skipped is None or clip != self._skipped.clip:
                 return False
-            self._store.skip(clip, self.rater.id, 0, reason=reason, repeat=self._skipped.repeat)
+            self._store.ratings.skip(clip, self.rater.id, 0, reason=reason, repeat=self._skipped.repeat)
             self._skipped, self.explained = None, True
             return True
 
@@ -174,10 +176,10 @@ class Desk:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            last = self._store.last_answer(self._run, self.rater.id)
+            last = self._store.ratings.last_answer(self._run, self.rater.id)
             if last is None or last.clip != clip:
                 return False
-            self._store.undo(clip, self.rater.id, repeat=last.repeat)
+            self._store.ratings.undo(clip, self.rater.id, repeat=last.repeat)
             if self._upcoming is not None and self._current is not None:
                 self._assignment.release(self._holder, self._upcoming.clip)
             self._upcoming = self._current or self._upcoming
@@ -213,7 +215,7 @@ class Desk:
         return round(1000 * (self._clock() - self._shown_at))
 
     def _pictures(self, clip: int) -> np.ndarray:
-        shown = self._store.clip(clip)
+        shown = self._store.clips.get(clip)
         assert shown is not None
         return picture_of_step(shown, self._dt, self._demo)
 
@@ -230,7 +232,7 @@ class Desk:
         asked = (
             ask.clip in waiting
             if ask.kind == "fresh"
-            else not self._store.holds(ask.clip, self.rater.id, repeat=ask.repeat)
+            else not self._store.ratings.holds(ask.clip, self.rater.id, repeat=ask.repeat)
         )
         return asked and self._take([ask.clip]) is not None
 
@@ -243,18 +245,18 @@ class Desk:
             return None
         if self._kind != "fresh":
             kind, self._kind = self._kind, "fresh"
-            mine = self._store.answered(self._run, rater_id=self.rater.id)
+            mine = self._store.ratings.answered(self._run, rater_id=self.rater.id)
             if kind == "repeated":
                 clip = self._take(to_repeat(mine, self.rater.id))
             else:
-                clip = self._take(to_share([*mine, *self._store.answered(self._run)], self.rater.id))
+                clip = self._take(to_share([*mine, *self._store.ratings.answered(self._run)], self.rater.id))
             if clip is not None:
                 return Ask(clip, kind)
         clip = self._take(waiting)
         return Ask(clip) if clip is not None else None
 
     def _waiting(self) -> list[int]:
-        return [clip.id for clip in self._store.waiting_clips(self._run)]
+        return [clip.id for clip in self._store.clips.waiting(self._run)]
 
     def _take(self, clips: list[int]) -> int | None:
         avoid = () if self._current is None else (self._current.clip,)

@@ -45,7 +45,7 @@ def export(
     from onedemo.storage.ratings import SKIP_COLUMNS
 
     with open_store(data_dir, must_exist=True) as store:
-        runs = [entry["id"] for entry in store.runs()]
+        runs = [entry["id"] for entry in store.runs.all()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
         others = (segments, comparisons, skips, card)
@@ -57,10 +57,10 @@ def export(
         if card is not None:
             write_atomic(card, card_of(store, run).encode())
         if comparisons is not None:
-            write_atomic(comparisons, csv_blocks(store.iter_comparisons(run), COMPARISON_COLUMNS))
+            write_atomic(comparisons, csv_blocks(store.comparisons.stream(run), COMPARISON_COLUMNS))
         if skips is not None:
-            write_atomic(skips, csv_blocks(store.iter_skips(run), SKIP_COLUMNS))
-        blocks = csv_blocks(store.iter_ratings(run, rater=rater))
+            write_atomic(skips, csv_blocks(store.ratings.stream_skips(run), SKIP_COLUMNS))
+        blocks = csv_blocks(store.ratings.stream(run, rater=rater))
         if out is not None:
             write_atomic(out, blocks)
         elif not any(others):
@@ -90,7 +90,8 @@ def open_store(data_dir: Path, must_exist: bool = False) -> Any:
     """
     from contextlib import closing
 
-    from onedemo.storage.store import FILE_NAME, Store
+    from onedemo.storage.database import FILE_NAME
+    from onedemo.storage.store import Store
 
     if must_exist and not (data_dir / FILE_NAME).exists():
         raise UserError(f"no {FILE_NAME} in {data_dir}; give the directory with --data-dir")

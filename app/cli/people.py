@@ -35,13 +35,13 @@ def add(
     name = check_person(name)
     lasts = read_span(expires) if expires is not None else None
     with open_store(data_dir) as store:
-        person = store.ensure_rater(name, "researcher" if researcher else "annotator")
+        person = store.accounts.ensure(name, "researcher" if researcher else "annotator")
         if once or lasts is not None:
             url = passing_link(store, person, url, once=once, lasts=lasts)
         else:
             url = issue_link(store, read_secret(data_dir), person, url)
         kind = ("once" if once else "standing") + (f", {expires}" if lasts else "")
-        store.add_audit(COMMAND_LINE, "made a link", f"for {person.name}, {person.role} ({kind})")
+        store.audit.add(COMMAND_LINE, "made a link", f"for {person.name}, {person.role} ({kind})")
         print(url)
 
 
@@ -49,7 +49,7 @@ def add(
 def list_(*, data_dir: DataDir = DATA) -> None:
     """Everybody."""
     with open_store(data_dir, must_exist=True) as store:
-        for person in store.raters():
+        for person in store.accounts.raters():
             print(f"{person.name:24} {person.role}")
 
 
@@ -62,7 +62,7 @@ def links(*, data_dir: DataDir = DATA) -> None:
             (str(link.id), link.rater.name, link.rater.role, link.state, "once" if link.once else "-",
              *(time[:16].replace("T", " ") if time else "-"
                for time in (link.created_at, link.expires_at, link.last_used_at)))
-            for link in store.links()
+            for link in store.accounts.links()
         ]  # fmt: skip
     widths = [max(len(row[column]) for row in (heads, *rows)) for column in range(len(heads))]
     for row in (heads, *rows):
@@ -81,16 +81,16 @@ def revoke(name: str | None = None, /, *, link: int | None = None, data_dir: Dat
         raise UserError("name the rater whose links are to end, or one link with --link N")
     with open_store(data_dir, must_exist=True) as store:
         if link is not None:
-            ended = store.revoke_link(link)
-            store.add_audit(COMMAND_LINE, "revoked a link", f"{ended.id} of {ended.rater.name}")
+            ended = store.accounts.revoke_link(link)
+            store.audit.add(COMMAND_LINE, "revoked a link", f"{ended.id} of {ended.rater.name}")
             whose = f"link {ended.id} of {ended.rater.name}"
             print(f"ended {whose} and the pages opened with it; the ratings stay")
             return
-        raters = {person.name: person for person in store.raters()}
+        raters = {person.name: person for person in store.accounts.raters()}
         if name not in raters:
             raise UserError(f"no rater {name!r}; there are: {', '.join(raters) or 'none'}")
-        count = store.revoke_tokens(raters[name].id)
-        store.add_audit(COMMAND_LINE, "revoked a rater", name)
+        count = store.accounts.revoke_tokens(raters[name].id)
+        store.audit.add(COMMAND_LINE, "revoked a rater", name)
         print(f"ended {count} links and sessions of {name}; the ratings stay")
 
 
@@ -107,7 +107,7 @@ def audit(*, csv: Path | None = None, data_dir: DataDir = DATA) -> None:
     with open_store(data_dir, must_exist=True) as store:
         if csv is not None:
             check_output(csv, data_dir)
-            write_atomic(csv, csv_blocks(store.audit(), AUDIT_COLUMNS))
+            write_atomic(csv, csv_blocks(store.audit.lines(), AUDIT_COLUMNS))
             return
-        for at, who, what, detail in store.audit():
+        for at, who, what, detail in store.audit.lines():
             print(f"{at[:19].replace('T', ' ')}  {who:24} {what}{': ' if detail else ''}{detail}")

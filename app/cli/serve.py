@@ -81,7 +81,7 @@ def serve(
         url = front.start()
         study.trainer.start()
         for role in ("researcher", "annotator"):
-            rater = store.ensure_rater(role, role)
+            rater = store.accounts.ensure(role, role)
             print(f"{role}: {issue_link(store, secret, rater, url)}", flush=True)
         ended.wait()
     finally:

@@ -20,7 +20,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         run: Of this run alone.
         now: When it is written.
     """
-    runs = [entry for entry in store.runs() if run in (None, entry["id"])]
+    runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
     when = f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     parts = [
         f"# Ratings of robot motion: {run or 'all runs'}\n\n"
@@ -51,10 +51,10 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
 
 def _run(store: Store, entry: dict[str, Any]) -> str:
     run = entry["id"]
-    people = {rater.name: rater for rater in store.raters()}
+    people = {rater.name: rater for rater in store.accounts.raters()}
     rows = rating_rows(store, run)
     whole, each = quality(rows), quality_by_rater(rows)
-    left_out = store.left_out(run)
+    left_out = store.ratings.left_out(run)
     classes = map(str, range(1, 6))
     heads = ("rater", "role", "ratings", *classes, "alpha", "same on repeats", "median s", "note")
     lines = [_line(("all", "", *_figures(whole), ""))]

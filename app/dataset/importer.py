@@ -37,13 +37,13 @@ def import_data(ratings: Path, segments: Path, data_dir: Path) -> dict[str, int]
     rows = list(_rows(ratings))
     store = Store(data_dir)
     try:
-        if store.runs():
+        if store.runs.all():
             raise UserError(f"{data_dir} holds runs already; import into an empty data directory")
-        with store.transaction():
+        with store.database.transaction():
             for run in runs:
                 _check_run(run, segments)
-                store.add_run(run=run["id"], **{name: run[name] for name in _RUN[1:]})
-            clips = store.restore_clips(read_segments(segments))
+                store.runs.add(run=run["id"], **{name: run[name] for name in _RUN[1:]})
+            clips = store.clips.restore(read_segments(segments))
             raters: dict[str, int] = {}
             for number, row in enumerate(rows, start=2):
                 if row["clip_id"] not in clips:
@@ -52,13 +52,13 @@ def import_data(ratings: Path, segments: Path, data_dir: Path) -> dict[str, int]
                     role = roles.get(row["rater"], "annotator")
                     if not 1 <= len(row["rater"]) <= LONGEST or not row["rater"].isprintable():
                         raise UserError(f"{ratings}, line {number}: {row['rater'][:80]!a} is no rater's name")
-                    raters[row["rater"]] = store.ensure_rater(row["rater"], role).id
+                    raters[row["rater"]] = store.accounts.ensure(row["rater"], role).id
                 try:
-                    store.restore_rating(row, raters[row["rater"]])
+                    store.ratings.restore(row, raters[row["rater"]])
                 except sqlite3.IntegrityError as error:
                     raise UserError(f"{ratings}, line {number}: {error}") from None
             for run, rater in sorted({(row["run"], row["rater"]) for row in rows if row["left_out"]}):
-                store.leave_out(run, raters[rater], by=raters[rater])
+                store.ratings.leave_out(run, raters[rater], by=raters[rater])
         for run in runs:
             write_atomic(RunDirectory(data_dir, run["id"]).config, run["config"].encode())
     finally:

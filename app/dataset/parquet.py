@@ -34,7 +34,7 @@ def write_segments(
     Args:
         file: Where to.
         clips: In any order; read one by one.
-        runs: Those they belong to, as ``Store.runs`` gives them.
+        runs: Those they belong to, as ``Store.runs.all`` gives them.
         roles: Of the raters, by name.
 
     Returns:

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from onedemo.app.dataset.parquet import write_segments
 from onedemo.core.files import replacing
-from onedemo.storage.store import RATING_COLUMNS, Store
+from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.store import Store
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
@@ -62,7 +63,7 @@ def write_parquet(store: Store, run: str | None, file: Path) -> int:
 
     A file that is there already is replaced once the new one is whole.
     """
-    runs = [entry for entry in store.runs() if run in (None, entry["id"])]
-    roles = {rater.name: rater.role for rater in store.raters()}
+    runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
+    roles = {rater.name: rater.role for rater in store.accounts.raters()}
     with replacing(file) as half:
-        return write_segments(half, store.rated_clips(run), runs, roles)
+        return write_segments(half, store.clips.rated(run), runs, roles)

@@ -120,7 +120,7 @@ class Door:
             raise web.HTTPForbidden(text="This page can only be used from its own address.")
         if what := self._audited.get(request.match_info.handler):
             detail = request.query_string
-            await asyncio.to_thread(self._store.add_audit, request[RATER].name, what, detail)
+            await asyncio.to_thread(self._store.audit.add, request[RATER].name, what, detail)
         return await handler(request)
 
     async def _recognise(self, request: web.Request) -> None:
@@ -128,7 +128,7 @@ class Door:
         known: list[tuple[Rater, str]] = []
         for token in self._tokens(request):
             digest = hash_token(token)
-            rater = await asyncio.to_thread(self._store.rater_of, digest, "session")
+            rater = await asyncio.to_thread(self._store.accounts.rater_of, digest, "session")
             if rater is not None:
                 known.append((rater, digest))
         if "rater" in request.match_info:  # the page, and its WebSocket, of this rater alone
@@ -161,7 +161,7 @@ class Door:
         token = request.query.get("token", "")
         if not token:
             return self._login_page(200)
-        link = await asyncio.to_thread(self._store.link, hash_token(token))
+        link = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         if link is not None and link.once and link.state == "open":
             response = self._login_page(200, token=token)
             # With no-referrer a browser would not say that it is this page that posts the form.
@@ -175,7 +175,7 @@ class Door:
         token = fields.get("token", "")
         if not isinstance(token, str) or not token:
             return self._login_page(403, _REFUSED["unknown"])
-        link = await asyncio.to_thread(self._store.link, hash_token(token))
+        link = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         return await self._open(request, token, link)
 
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
@@ -184,10 +184,12 @@ class Door:
         session = new_session_token()
         opened = None
         if link is not None:
-            opened = await asyncio.to_thread(self._store.open_link, hash_token(token), hash_token(session))
+            opened = await asyncio.to_thread(
+                self._store.accounts.open_link, hash_token(token), hash_token(session)
+            )
         if opened is None:
             return await self._refuse(request, token, link)
-        await asyncio.to_thread(self._store.add_audit, opened.rater.name, "came in", f"link {opened.id}")
+        await asyncio.to_thread(self._store.audit.add, opened.rater.name, "came in", f"link {opened.id}")
         response = web.HTTPSeeOther(f"/r/{opened.rater.id}")
         # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
         response.set_cookie(
@@ -205,15 +207,18 @@ class Door:
         address = self._listening.client(request)
         self._wrong[address].take()
         why = "unknown" if link is None else link.state
-        await asyncio.to_thread(self._store.add_audit, address, "was refused", f"{why} link")
+        await asyncio.to_thread(self._store.audit.add, address, "was refused", f"{why} link")
         if link is None:
             return self._login_page(403, _REFUSED["unknown"])
         if link.state in ("used", "expired"):  # clicked again in the browser that it let in
             for session in self._tokens(request):
-                if await asyncio.to_thread(self._store.came_by, hash_token(session)) == link.id:
+                if (
+                    await asyncio.to_thread(self._store.accounts.link_of_session, hash_token(session))
+                    == link.id
+                ):
                     raise web.HTTPSeeOther(f"/r/{link.rater.id}")
         # Read anew: of two who press at once, one finds it used.
-        now = await asyncio.to_thread(self._store.link, hash_token(token))
+        now = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         assert now is not None
         return self._login_page(403, _REFUSED.get(now.state, _REFUSED["unknown"]))
 

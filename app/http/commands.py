@@ -40,13 +40,13 @@ class Actions:
         fields = {key: value for key, value in body.items() if key != "do"}
         actions[body["do"]](who, fields)
         detail = ", ".join(f"{key} {value}" for key, value in fields.items() if value != "")
-        self._store.add_audit(who.name, body["do"], f"{detail}; run {self._page.trainer.run}")
+        self._store.audit.add(who.name, body["do"], f"{detail}; run {self._page.trainer.run}")
 
     def _leave_out(self, who: Rater, fields: dict[str, Any]) -> None:
-        self._store.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)
+        self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)
 
     def _take_in(self, who: Rater, fields: dict[str, Any]) -> None:
-        self._store.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
+        self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
 
     def _open(self, who: Rater, fields: dict[str, Any]) -> None:
         _check(fields, {"run": str})
@@ -77,7 +77,7 @@ class Actions:
 
     def _rater(self, fields: dict[str, Any]) -> int:
         _check(fields, {"rater": int})
-        if fields["rater"] not in {rater.id for rater in self._store.raters()}:
+        if fields["rater"] not in {rater.id for rater in self._store.accounts.raters()}:
             raise ValueError(f"there is no rater {fields['rater']}")
         return fields["rater"]
 

@@ -40,17 +40,17 @@ class Downloads:
 
     async def csv(self, request: web.Request) -> web.StreamResponse:
         """The ratings."""
-        rows = self._store.iter_ratings(**read_filters(request.query))
+        rows = self._store.ratings.stream(**read_filters(request.query))
         return await self._stream(request, "ratings", ratings_csv.csv_blocks(rows))
 
     async def comparisons(self, request: web.Request) -> web.StreamResponse:
         """The answers about pairs."""
-        rows = self._store.iter_comparisons(read_filters(request.query).get("run"))
+        rows = self._store.comparisons.stream(read_filters(request.query).get("run"))
         return await self._stream(request, "comparisons", ratings_csv.csv_blocks(rows, COMPARISON_COLUMNS))
 
     async def skips(self, request: web.Request) -> web.StreamResponse:
         """Skipped clips, and why."""
-        rows = self._store.iter_skips(read_filters(request.query).get("run"))
+        rows = self._store.ratings.stream_skips(read_filters(request.query).get("run"))
         return await self._stream(request, "skips", ratings_csv.csv_blocks(rows, SKIP_COLUMNS))
 
     async def _stream(
@@ -99,7 +99,7 @@ class Downloads:
         return web.Response(text=html, content_type="text/html")
 
     def _table(self, filters: dict[str, Any]) -> str:
-        rows = self._store.iter_ratings(**filters)
+        rows = self._store.ratings.stream(**filters)
         shown = list(islice(rows, _SHOWN))
         more = sum(1 for _ in rows)
         return render("data.html:preview", rows=shown, count=len(shown) + more, columns=RATINGS)

@@ -76,7 +76,7 @@ class Files:
         """The picture of a clip."""
         number = int(request.match_info["clip"])
         trainer = self._page.trainer
-        clip = await asyncio.to_thread(trainer.store.clip, number)
+        clip = await asyncio.to_thread(trainer.store.clips.get, number)
         if clip is None or clip.run != trainer.run:
             raise web.HTTPNotFound()
         return _jpeg(trainer.clip_file(number))
@@ -85,7 +85,7 @@ class Files:
         """The picture of a pair."""
         number = int(request.match_info["pair"])
         trainer = self._page.trainer
-        if await asyncio.to_thread(trainer.store.pair_run, number) != trainer.run:
+        if await asyncio.to_thread(trainer.store.comparisons.pair_run, number) != trainer.run:
             raise web.HTTPNotFound()
         return _jpeg(trainer.pair_file(number))
 

@@ -79,8 +79,8 @@ def issue_link(store: Store, secret: bytes, rater: Rater, base_url: str) -> str:
         rater: Whom the link is for.
         base_url: Of the front, such as ``http://127.0.0.1:8080``.
     """
-    token = link_token(secret, rater, store.count_revoked_links(rater.id))
-    store.add_token(hash_token(token), rater.id, "link")
+    token = link_token(secret, rater, store.accounts.count_revoked_links(rater.id))
+    store.accounts.add_token(hash_token(token), rater.id, "link")
     return f"{base_url.rstrip('/')}/login?token={token}"
 
 
@@ -97,7 +97,7 @@ def passing_link(
         lasts: Until it expires; None: it does not.
     """
     token = new_session_token()
-    store.add_token(hash_token(token), rater.id, "link", once=once, lasts=lasts)
+    store.accounts.add_token(hash_token(token), rater.id, "link", once=once, lasts=lasts)
     return f"{base_url.rstrip('/')}/login?token={token}"
 
 

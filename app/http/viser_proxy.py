@@ -117,7 +117,9 @@ class Proxy:
         while True:
             await asyncio.sleep(_LOOK_S)
             try:
-                ended = await asyncio.to_thread(self._store.ended, set(self._sockets.values()))
+                ended = await asyncio.to_thread(
+                    self._store.accounts.ended_sessions, set(self._sockets.values())
+                )
             except sqlite3.Error:  # locked, say: it is looked at again
                 continue
             for browser, session in tuple(self._sockets.items()):

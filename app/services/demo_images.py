@@ -27,7 +27,7 @@ def version_of(store: Store, run: str) -> str:
 
     Browsers keep pictures for good, and clips of other data at the same address have the same numbers.
     """
-    made = next(entry["created_at"] for entry in store.runs() if entry["id"] == run)
+    made = next(entry["created_at"] for entry in store.runs.all() if entry["id"] == run)
     return f"{zlib.crc32(f'{run} {made}'.encode()):08x}"
 
 

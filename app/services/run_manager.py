@@ -86,7 +86,7 @@ class Study:
         with self._change:
             if run == self.trainer.run:
                 raise UserError(f"run {run!r} is being served already")
-            known = {entry["id"]: entry for entry in self._store.runs()}
+            known = {entry["id"]: entry for entry in self._store.runs.all()}
             if run not in known:
                 raise UserError(f"no run {run!r}; there are: {', '.join(known)}")
             demo = find_demo(known[run]["demo"], self._data_dir / "demos")

@@ -137,7 +137,7 @@ class Page:
 
     def _context(self, client: viser.ClientHandle, rater: Rater, *, dark: bool) -> TabContext:
         trainer, lesson = self.trainer, Lesson()
-        if trainer.store.has_practised(rater.id):
+        if trainer.store.accounts.has_practised(rater.id):
             lesson.leave()
         return TabContext(
             client=client, rater=rater, dark=dark, lesson=lesson, store=trainer.store, run=trainer.run,
@@ -155,7 +155,7 @@ class Page:
 
     def _rater(self, rater_id: int) -> Rater | None:
         if rater_id not in self._raters:
-            self._raters = {rater.id: rater for rater in self.trainer.store.raters()}
+            self._raters = {rater.id: rater for rater in self.trainer.store.accounts.raters()}
         return self._raters.get(rater_id)
 
     def _tick(self) -> None:

@@ -71,7 +71,7 @@ class Compare(Pressing):
         undo = {"data-undo-pair": undoable} if undoable else None
         with self._client.atomic():
             self._put(
-                self._top, render("compare.html:top", count=context.store.count_comparisons(context.run))
+                self._top, render("compare.html:top", count=context.store.comparisons.count(context.run))
             )
             if asking:
                 stage = render(

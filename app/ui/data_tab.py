@@ -51,7 +51,7 @@ class Data:
 
     def refresh(self, status: Status) -> None:
         """Counts again if somebody looks, beside the thread that serves all pages."""
-        event = self._store.last_event()
+        event = self._store.ratings.last_event()
         old = time.monotonic() - self._counted_at > _EVERY_S
         if not self._shown or event == self._counted or not (old or self._counted < 0):
             return
@@ -65,11 +65,12 @@ class Data:
         try:
             store, run = self._store, self._run
             rows = rating_rows(store, run)
-            skips = Counter(row[SKIP_COLUMNS.index("rater")] for row in store.iter_skips(run))
-            people = {rater.name: rater for rater in store.raters()}
+            skips = Counter(row[SKIP_COLUMNS.index("rater")] for row in store.ratings.stream_skips(run))
+            people = {rater.name: rater for rater in store.accounts.raters()}
             figures = data_html(
-                run, method, store.tallies(run), quality(rows), quality_by_rater(rows, raters=skips), skips,
-                people, store.left_out(run),
+                run, method, store.ratings.tallies(run), quality(rows), quality_by_rater(rows, raters=skips),
+                skips,
+                people, store.ratings.left_out(run),
             )  # fmt: skip
             self._html.content = str(figures)
             self._counted, self._counted_at = event, time.monotonic()
@@ -88,7 +89,7 @@ def data_html(
     Args:
         run: Whose ratings.
         method: How it learns.
-        counts: As ``Store.tallies``.
+        counts: As ``Store.ratings.tallies``.
         whole: Quality of all ratings.
         each: Of each rater's, by name.
         skips: Clips that each skipped, by name.

@@ -82,7 +82,7 @@ class Rate(Pressing):
             case presses.Practise():
                 counted = self._lesson.take(press.exercise, press.do)
                 if counted and self._lesson.over:
-                    self._context.store.set_practised(self._context.rater.id)
+                    self._context.store.accounts.set_practised(self._context.rater.id)
                     self._desk.refill()
                 return counted
             case _ if not self._lesson.over:
@@ -108,7 +108,7 @@ class Rate(Pressing):
     def _draw_clip(self) -> None:
         context, desk, status = self._context, self._desk, self._status
         clip, target = desk.current, status.target_ratings
-        count = context.store.count_learned(context.run)  # as many as the trainer counts
+        count = context.store.ratings.count_for_training(context.run)  # as many as the trainer counts
         asking = clip is not None
         self._put(self._top, render("rate.html:top", count=count, target=target, asking=asking))
         if asking:

@@ -48,7 +48,7 @@ class Runs:
         ]
         demos = [demo.name for demo in list_demos(context.data_dir / "demos")]
         # The forms are drawn once, so that nothing that is being filled in is lost.
-        runs = [entry["id"] for entry in self._store.runs()]
+        runs = [entry["id"] for entry in self._store.runs.all()]
         gui.add_html(str(render("runs.html:new_run", demos=demos, methods=list(METHODS), runs=runs)))
         gui.add_html(str(render("runs.html:new_demo", megabytes=LARGEST >> 20)))
 
@@ -67,13 +67,13 @@ class Runs:
         with self._lock:
             if not self._shown:
                 return
-            runs = self._store.runs()
+            runs = self._store.runs.all()
             drawn, more = chosen_runs([run["id"] for run in runs], self._wanted.value, self._run)
             grown = drawn != self._drawn
             for run in drawn:
                 rows = self._rows.setdefault(run, [])
                 if run == self._run or not rows:
-                    new = self._store.iterations(run, after=rows[-1]["number"] if rows else 0)
+                    new = self._store.runs.iterations(run, after=rows[-1]["number"] if rows else 0)
                     rows += new
                     grown |= bool(new)
             told = str(runs_html(runs, self._figures(runs), self._run, status, drawn))
@@ -94,8 +94,8 @@ class Runs:
         for run in runs:
             name = run["id"]
             rows = self._rows.get(name)
-            last = rows[-1] if rows else (self._store.last_iteration(name) or {})
-            figures[name] = {"ratings": sum(self._store.ratings_by_class(name)), **last}
+            last = rows[-1] if rows else (self._store.runs.last_iteration(name) or {})
+            figures[name] = {"ratings": sum(self._store.ratings.by_class(name)), **last}
         return figures
 
 
@@ -133,7 +133,7 @@ def runs_html(
     """The table of runs, the newest first.
 
     Args:
-        runs: As ``Store.runs``.
+        runs: As ``Store.runs.all``.
         figures: Of each: ``ratings``, and the newest iteration's.
         current: The one that is served.
         status: Of that one.

@@ -90,14 +90,14 @@ class Watch:
                 return
             self._practised = status.iteration > 0
             store, run = self._store, self._run
-            counts = store.ratings_by_class(run)
+            counts = store.ratings.by_class(run)
             strip = render(
                 "watch.html:strip", status=status, confirming=time.monotonic() < self._confirm_until,
-                ratings=sum(counts), learned=store.count_learned(run),
+                ratings=sum(counts), learned=store.ratings.count_for_training(run),
             )  # fmt: skip
             self._put(self._strip, strip)
             self._put(self._classes, render("parts.html:classes", counts=counts, answers=ANSWERS))
-            new = store.iterations(run, after=self._charts.last)
+            new = store.runs.iterations(run, after=self._charts.last)
             self._charts.extend(new)
             if new:
                 self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
@@ -134,7 +134,7 @@ class Watch:
         self.refresh(self._training.status())
 
     def _log(self, what: str) -> None:
-        self._store.add_audit(self._context.rater.name, what, self._run)
+        self._store.audit.add(self._context.rater.name, what, self._run)
 
     # The robot
 

@@ -34,7 +34,7 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
     from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
-    new = store.ensure_rater("new", "annotator")
+    new = store.accounts.ensure("new", "annotator")
     practice = issue_link(store, read_secret(store.path.parent), new, site.url)
     with opened(chromium, practice, viewport, color_scheme=scheme) as page:
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
@@ -43,8 +43,8 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
         page.wait_for_selector(".od-feedback")
         assert_nothing_serious(page, "feedback")
     site.trainer.add_pairs(2)
-    store.rate(site.trainer.add_clips(1)[0], new.id, 3, 900)
-    store.add_iteration(
+    store.ratings.rate(site.trainer.add_clips(1)[0], new.id, 3, 900)
+    store.runs.add_iteration(
         site.trainer.run, 1, snapshot=1, env_steps=16_000,
         stats={"predicted": 2.0, "kl": 0.01, "best": 2.5, "timeline": [None] * 20 + [2.0] * 20},
     )  # fmt: skip
@@ -69,7 +69,7 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
         assert_nothing_serious(page, "keys")
         page.keyboard.press("Escape")
         page.wait_for_selector(".od-help", state="hidden")  # until then presses are not for the clip
-        store.set_clip_state([c.id for c in store.waiting_clips(site.trainer.run)], "withdrawn")
+        store.clips.set_state([c.id for c in store.clips.waiting(site.trainer.run)], "withdrawn")
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         page.wait_for_selector(".od-waiting, .od-clip")
         assert_nothing_serious(page, "waiting")

@@ -123,7 +123,7 @@ def test_a_proxy_is_believed_only_where_there_is_one(site):
     finally:
         front.close()
     ask(site.url, "/login?token=wrong", headers=asked)
-    who = [line[1] for line in site.trainer.store.audit() if line[2] == "was refused"]
+    who = [line[1] for line in site.trainer.store.audit.lines() if line[2] == "was refused"]
     assert who == ["10.0.0.9", "127.0.0.1"]
 
 
@@ -133,7 +133,7 @@ def test_a_proxy_is_believed_only_where_there_is_one(site):
 @pytest.mark.seam
 def test_a_link_that_opens_once_opens_once_and_for_nobody_who_only_looks(site):
     store = site.trainer.store
-    bo = next(rater for rater in store.raters() if rater.name == "bo")
+    bo = next(rater for rater in store.accounts.raters() if rater.name == "bo")
     link = passing_link(store, bo, site.url, once=True).removeprefix(site.url)
     token = link.split("token=")[1]
     for _ in range(3):  # mail scanners and previews
@@ -153,7 +153,7 @@ def test_a_link_that_opens_once_opens_once_and_for_nobody_who_only_looks(site):
 @pytest.mark.seam
 def test_a_link_ends_when_its_time_is_over(site):
     store = site.trainer.store
-    bo = next(rater for rater in store.raters() if rater.name == "bo")
+    bo = next(rater for rater in store.accounts.raters() if rater.name == "bo")
     link = passing_link(store, bo, site.url, lasts=read_span("1m")).removeprefix(site.url)
     assert ask(site.url, link)[0] == 303
     with closing(sqlite3.connect(store.path)) as db:  # the minute has gone by
@@ -161,15 +161,15 @@ def test_a_link_ends_when_its_time_is_over(site):
         db.commit()
     status, _, text = ask(site.url, link)
     assert status == 403 and "time of this link is over" in text
-    state = {link.rater.name: link.state for link in store.links()}
+    state = {link.rater.name: link.state for link in store.accounts.links()}
     assert state["bo"] == "expired"
 
 
 def test_only_hashes_of_tokens_are_kept(tmp_path):
     with closing(Store(tmp_path)) as store:
-        bo = store.ensure_rater("bo", "annotator")
+        bo = store.accounts.ensure("bo", "annotator")
         links = [passing_link(store, bo, "http://x", once=once) for once in (True, False)]
-        store.open_link(hash_token(links[1].split("token=")[1]), hash_token("session"))
+        store.accounts.open_link(hash_token(links[1].split("token=")[1]), hash_token("session"))
     kept = b"".join(path.read_bytes() for path in tmp_path.iterdir())
     for link in links:
         token = link.split("token=")[1]
@@ -217,7 +217,9 @@ def test_revoking_ends_open_pages_within_two_seconds(site):
             for tab in (bo, cy):
                 await tab.until(lambda tab=tab: tab.clip, "a clip")
             began = time.monotonic()
-            await asyncio.to_thread(store.revoke_tokens, next(r.id for r in store.raters() if r.name == "bo"))
+            await asyncio.to_thread(
+                store.accounts.revoke_tokens, next(r.id for r in store.accounts.raters() if r.name == "bo")
+            )
             while not bo.socket.closed:
                 assert time.monotonic() < began + 10, "the page stays open"
                 await asyncio.sleep(0.05)
@@ -248,7 +250,7 @@ def test_wrong_links_are_tried_only_so_often(site):
     said = run(go())
     assert said[:WRONG_LINKS_AT_ONCE] == [403] * WRONG_LINKS_AT_ONCE
     assert set(said[WRONG_LINKS_AT_ONCE:]) == {429}
-    refused = [line for line in site.trainer.store.audit() if line[2] == "was refused"]
+    refused = [line for line in site.trainer.store.audit.lines() if line[2] == "was refused"]
     assert len(refused) == WRONG_LINKS_AT_ONCE  # a flood does not fill the log
 
 
@@ -437,8 +439,8 @@ def test_names_of_runs_and_demos_are_safe_as_files(name):
 
 def test_the_audit_log_cannot_be_changed(tmp_path):
     with closing(Store(tmp_path)) as store:
-        store.add_audit("bo", "did", "x\x1b[31m\n‮y" + "z" * 600)
-        ((_, who, what, detail),) = store.audit()
+        store.audit.add("bo", "did", "x\x1b[31m\n‮y" + "z" * 600)
+        ((_, who, what, detail),) = store.audit.lines()
         assert (who, what) == ("bo", "did") and detail.isprintable() and len(detail) == 500
     with closing(sqlite3.connect(store.path)) as db:
         for statement in ("DELETE FROM audit", "UPDATE audit SET who = 'cy'"):
@@ -471,7 +473,7 @@ def test_what_researchers_do_is_in_the_log(site):
             await tab.close()
 
     run(go())
-    lines = [(who, what, detail) for _, who, what, detail in site.trainer.store.audit()]
+    lines = [(who, what, detail) for _, who, what, detail in site.trainer.store.audit.lines()]
     assert [line[1] for line in lines] == [
         "came in", "took out ratings", "took out segments", "took out the data card", "took out comparisons",
         "took out skips", "leave out", "came in", "paused the run",

@@ -14,7 +14,7 @@ from browser.test_page import drag_slider, opened, shown_clip, until
 from helpers.server_process import Serving
 from helpers.stick_figure import backflip_video
 from onedemo.app.cli.main import main
-from onedemo.storage.store import FILE_NAME
+from onedemo.storage.database import FILE_NAME
 
 pytestmark = pytest.mark.seam
 

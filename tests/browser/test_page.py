@@ -138,10 +138,10 @@ def test_tabs_of_one_browser_keep_their_own_rater(chromium, site):
 @pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_no_tab_is_wider_than_the_screen(chromium, site, viewport):
     store = site.trainer.store
-    long_name = store.ensure_rater("Annabella-Victoria of a Long Name", "annotator")
-    store.rate(1, long_name.id, 3, 900)
+    long_name = store.accounts.ensure("Annabella-Victoria of a Long Name", "annotator")
+    store.ratings.rate(1, long_name.id, 3, 900)
     site.trainer.add_pairs(2)
-    store.add_iteration(
+    store.runs.add_iteration(
         site.trainer.run, 1, snapshot=1, env_steps=16_000, stats={"predicted": 2.0, "best": 2.5}
     )
     with opened(chromium, site.links["researcher"], viewport) as page:
@@ -211,7 +211,7 @@ def test_undo_and_skip(chromium, site):
         page.wait_for_selector(".od-notice >> text=Taken back: you had said 1: Not at all.")
         press_and_wait(page, site, lambda: page.keyboard.press("2"))
         page.wait_for_selector(".od-notice", state="detached")
-        assert [row[1:6:4] for row in site.trainer.store.iter_ratings()] == [(first, 2)]
+        assert [row[1:6:4] for row in site.trainer.store.ratings.stream()] == [(first, 2)]
 
 
 def test_keys_do_nothing_on_another_tab(chromium, site):
@@ -238,7 +238,7 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         clip = shown_clip(page)
         with monkeypatch.context() as patch:
             patch.setattr(
-                store,
+                store.ratings,
                 "rate",
                 lambda *_, **__: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")),
             )
@@ -251,7 +251,7 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         page.wait_for_selector(".od-problem", state="detached")
         site.trainer.set_status(phase="online", message="The robot is practising.", next_clips_s=20.0)
-        store.set_clip_state([c.id for c in store.waiting_clips(site.trainer.run)], "withdrawn")
+        store.clips.set_state([c.id for c in store.clips.waiting(site.trainer.run)], "withdrawn")
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         page.wait_for_selector("text=The robot is practising. New pairs in about 20 s.")
@@ -282,7 +282,7 @@ def test_researcher_sees_the_robot_move(chromium, site):
         page.wait_for_selector(".od-time >> text=has not practised yet")
         site.trainer.set_status(iteration=1)
         page.wait_for_selector(".od-time >> text=has not practised yet", state="detached")
-        site.trainer.store.add_iteration(
+        site.trainer.store.runs.add_iteration(
             site.trainer.run, 1, snapshot=1, env_steps=16000, stats={"predicted": 1.5, "kl": 0.01}
         )
         assert page.locator(".uplot").count() == 3

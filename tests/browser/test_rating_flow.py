@@ -17,7 +17,7 @@ def frame_of(page) -> int:
 
 
 def marks_of(site) -> list[tuple]:
-    return site.trainer.store.rows(
+    return site.trainer.store.database.rows(
         "SELECT clip_id, value, mark_from, mark_to FROM events WHERE kind = 'rate' ORDER BY id"
     )
 
@@ -27,7 +27,7 @@ def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromiu
     from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
-    new = store.ensure_rater("new", "annotator")
+    new = store.accounts.ensure("new", "annotator")
     link = issue_link(store, read_secret(store.path.parent), new, site.url)
     with opened(chromium, link, viewport) as page:
         page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
@@ -199,8 +199,8 @@ def test_on_a_slow_line_a_press_is_for_the_clip_that_was_on_screen(chromium, sit
 def test_the_same_clip_answered_at_another_page_is_said(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         clip = shown_clip(page)
-        rater = {rater.name: rater.id for rater in site.trainer.store.raters()}["bo"]
-        site.trainer.store.rate(clip, rater, 1, 900)
+        rater = {rater.name: rater.id for rater in site.trainer.store.accounts.raters()}["bo"]
+        site.trainer.store.ratings.rate(clip, rater, 1, 900)
         page.keyboard.press("4")
         page.wait_for_selector(".od-problem >> text=You had rated that clip at another page of yours")
         assert shown_clip(page) != clip
@@ -245,7 +245,9 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
 @BOTH
 def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site, viewport):
     def reasons():
-        return site.trainer.store.rows("SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id")
+        return site.trainer.store.database.rows(
+            "SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id"
+        )
 
     with opened(chromium, site.links["annotator"], viewport) as page:
         shown_clip(page)
@@ -344,7 +346,7 @@ def test_undo_outlives_a_reload_a_new_browser_and_a_restart(chromium, site):
     from onedemo.app.ui.app import Page
 
     store, clips = site.trainer.store, []
-    bo = store.ensure_rater("bo", "annotator")
+    bo = store.accounts.ensure("bo", "annotator")
 
     def take_back(page):
         shown_clip(page)

@@ -21,14 +21,14 @@ BOTH = pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "ph
 
 def rate_some(site):
     store = site.trainer.store
-    store.rows("PRAGMA synchronous = OFF")
+    store.database.rows("PRAGMA synchronous = OFF")
     ids = site.trainer.add_clips(30)
-    ann, bob = (store.ensure_rater(name, "annotator").id for name in ("Ann", "Bob <i>"))
+    ann, bob = (store.accounts.ensure(name, "annotator").id for name in ("Ann", "Bob <i>"))
     for k, clip in enumerate(ids):
-        store.rate(clip, ann, k % 5 + 1, 1500, mark=(13, 25) if k == 0 else None)
-        store.rate(clip, bob, 3, 320)
+        store.ratings.rate(clip, ann, k % 5 + 1, 1500, mark=(13, 25) if k == 0 else None)
+        store.ratings.rate(clip, bob, 3, 320)
         if k % 10 == 0:
-            store.rate(clip, ann, k % 5 + 1, 1500, repeat=True)
+            store.ratings.rate(clip, ann, k % 5 + 1, 1500, repeat=True)
     return ids
 
 
@@ -40,7 +40,7 @@ def to_tab(page, name):
 def test_whether_ratings_are_good_and_who_is_left_out(chromium, site, viewport):
     rate_some(site)
     store, run = site.trainer.store, site.trainer.run
-    bob = {rater.name: rater.id for rater in store.raters()}["Bob <i>"]
+    bob = {rater.name: rater.id for rater in store.accounts.raters()}["Bob <i>"]
     with opened(chromium, site.links["researcher"], viewport) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-quality >> text=30 clips", timeout=20_000)
@@ -49,34 +49,34 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site, viewport):
         page.wait_for_selector("text=100 % of the answers came before the clip had played once")
         row = page.locator("tr", has_text="Bob <i>").first
         row.locator("[data-do]").click()
-        until(lambda: store.left_out(run) == {bob})
+        until(lambda: store.ratings.left_out(run) == {bob})
         page.wait_for_selector(".od-left-out >> text=Bob <i>", timeout=20_000)
-        assert {rating.value for rating in store.ratings_as_of(run)} == {1, 2, 3, 4, 5}
-        assert len(store.ratings_as_of(run)) == 30
+        assert {rating.value for rating in store.ratings.for_training(run)} == {1, 2, 3, 4, 5}
+        assert len(store.ratings.for_training(run)) == 30
         assert page.locator(".od-nobody").count() == 0
         page.locator("tr", has_text="Ann").first.locator("[data-do]").click()
         page.wait_for_selector(".od-nobody >> text=Everybody is left out of training.", timeout=20_000)
         to_tab(page, "Watch")
         page.wait_for_selector(".od-nobody:visible >> text=goes on practising with the last predictor")
-        assert site.trainer.store.count_learned(run) == 0
+        assert site.trainer.store.ratings.count_for_training(run) == 0
         to_tab(page, "Data")
         for name in ("Ann", "Bob <i>"):
             row = page.locator(".od-left-out", has_text=name).locator('[data-do="take in"]')
             row.click()
             page.wait_for_selector(f'.od-left-out:has-text("{name}")', state="detached", timeout=20_000)
-        until(lambda: store.left_out(run) == set())
+        until(lambda: store.ratings.left_out(run) == set())
         page.wait_for_selector(".od-nobody", state="detached")
-        assert len(store.ratings_as_of(run)) == 60
+        assert len(store.ratings.for_training(run)) == 60
 
 
 def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_path):
     store, ids = site.trainer.store, site.trainer.add_clips(3)
-    ann = store.ensure_rater("=Ann", "annotator").id
-    store.skip(ids[0], ann, 700)
-    store.skip(ids[0], ann, 0, reason="It is too short to tell")
-    store.skip(ids[1], ann, 800)
-    store.skip(ids[2], ann, 900)
-    store.undo(ids[2], ann)
+    ann = store.accounts.ensure("=Ann", "annotator").id
+    store.ratings.skip(ids[0], ann, 700)
+    store.ratings.skip(ids[0], ann, 0, reason="It is too short to tell")
+    store.ratings.skip(ids[1], ann, 800)
+    store.ratings.skip(ids[2], ann, 900)
+    store.ratings.undo(ids[2], ann)
     with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Data")
         row = page.locator("tr", has_text="=Ann").first
@@ -136,7 +136,7 @@ def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, viewport,
 def test_parts_of_the_demo_and_the_best_rollouts(chromium, site, viewport):
     for k in range(1, 4):
         timeline = [None if i > 35 else round(2 + math.sin(i / 6), 2) for i in range(40)]
-        site.trainer.store.add_iteration(
+        site.trainer.store.runs.add_iteration(
             site.trainer.run, k, snapshot=k, env_steps=16000 * k,
             stats={"predicted": 2.0, "kl": 0.01, "best": 2.5 + k / 10, "timeline": timeline},
         )  # fmt: skip
@@ -159,13 +159,13 @@ def test_parts_of_the_demo_and_the_best_rollouts(chromium, site, viewport):
 @BOTH
 def test_runs_side_by_side(chromium, site, viewport):
     store = site.trainer.store
-    store.add_run(
+    store.runs.add(
         run="hop-1", demo="hopper-hop", demo_sha256="0", seed=4, config='method = "paper"\n', version="0"
     )
     for run, above in ((site.trainer.run, 1.0), ("hop-1", 0.0)):
         for k in range(1, 6):
             stats = {"predicted": 2 + above + k / 10, "kl": 0.01, "true_reward": 100.0 * k}
-            store.add_iteration(run, k, snapshot=k, env_steps=16000 * k, stats=stats)
+            store.runs.add_iteration(run, k, snapshot=k, env_steps=16000 * k, stats=stats)
     with opened(chromium, site.links["researcher"], viewport) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-runs >> text=hop-1")
@@ -187,10 +187,10 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site, viewpor
     store = site.trainer.store
     for seed in range(50):
         name = f"hop-{seed}"
-        store.add_run(
+        store.runs.add(
             run=name, demo="hopper-hop", demo_sha256="0", seed=seed, config='method = "paper"\n', version="0"
         )
-        store.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
+        store.runs.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
     with opened(chromium, site.links["researcher"], viewport) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-which >> text=6 runs drawn.")
@@ -226,7 +226,7 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site, viewport):
             return int(page.locator(".od-pair > div").get_attribute("data-pair"))
 
         def answers():
-            return [(row[1], row[5]) for row in site.trainer.store.iter_comparisons()]
+            return [(row[1], row[5]) for row in site.trainer.store.comparisons.stream()]
 
         expected = []
         for act, answer in (

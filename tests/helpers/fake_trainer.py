@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.rl.rollouts import Acting, EpisodeRules
-from onedemo.storage.store import NewClip, Store
+from onedemo.storage.clips import NewClip
+from onedemo.storage.store import Store
 from onedemo.types import Demo, Segment, Status
 
 FPS = 30.0
@@ -58,7 +59,7 @@ class StandIn:
             name="hopper-backflip", sha256="0" * 64, path=data_dir / "demo.mp4", fps=FPS, frames=240,
             width=480, height=360, task="backflip",
         )  # fmt: skip
-        self.store.add_run(
+        self.store.runs.add(
             run=self.run, demo=self.demo.name, demo_sha256="0" * 64, seed=0, config="", version="0"
         )
         self.frames = drawn_frames(self.demo.frames)
@@ -80,12 +81,12 @@ class StandIn:
             NewClip(demo_step=25 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
             for i in range(count)
         ]
-        ids = [clip.id for clip in self.store.add_clips(self.run, new)]
+        ids = [clip.id for clip in self.store.clips.add(self.run, new)]
         for number in ids:
             start = number * 9 % 200
             picture = compose_clip(self.frames[start : start + 10], drawn_frames(10, phase=number))
             self.clip_file(number).write_bytes(picture)
-        self.store.set_clip_state(ids, "ready")
+        self.store.clips.set_state(ids, "ready")
         return ids
 
     def set_status(self, **changes) -> None:
@@ -112,17 +113,17 @@ class StandIn:
         from onedemo.storage.comparisons import NewPair
 
         pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)
-        ids = [pair.id for pair in self.store.add_pairs(self.run, [pair] * count)]
+        ids = [pair.id for pair in self.store.comparisons.add_pairs(self.run, [pair] * count)]
         for number in ids:
             robots = [drawn_frames(10, phase=number + k) for k in range(2)]
             self.pair_file(number).write_bytes(compose_clip(self.frames[:10], *robots))
-        self.store.set_pair_state(ids, "ready")
+        self.store.comparisons.set_pair_state(ids, "ready")
         return ids
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         from onedemo.demos.video import write_webm
 
-        if not 1 <= iteration <= len(self.store.iterations(self.run)):
+        if not 1 <= iteration <= len(self.store.runs.iterations(self.run)):
             raise FileNotFoundError(iteration)
         file = self.directory / f"rollout-{iteration}.{suffix}"
         if suffix == "jpg":

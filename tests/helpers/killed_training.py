@@ -24,20 +24,24 @@ import onedemo.training.learner
 from helpers import small_world
 from onedemo.core import files
 from onedemo.reward.model import Snapshot
-from onedemo.storage.store import FILE_NAME, Store
+from onedemo.storage.clips import Clips
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.ratings import Ratings
+from onedemo.storage.runs import Runs
+from onedemo.storage.store import Store
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo
 
 MOMENTS = {
-    "amid the first ratings": ("store", "rate", 2, True),
+    "amid the first ratings": ("ratings", "rate", 2, True),
     "in a fit": ("learner", "fit", 2, False),
     "between a snapshot and its row": ("snapshot", "save", 2, True),
     "in the first iteration": ("learner", "iterate", 1, False),
     "with half a checkpoint": ("os", "replace", 2, False),
     "between a checkpoint and its row": ("os", "replace", 1, True),
-    "between two iterations": ("store", "add_iteration", 2, True),
-    "with questions asked and not answered": ("store", "add_clips", 1, True),
-    "after an answer": ("store", "rate", 1, True),
+    "between two iterations": ("runs", "add_iteration", 2, True),
+    "with questions asked and not answered": ("clips", "add", 1, True),
+    "after an answer": ("ratings", "rate", 1, True),
 }
 """Where a process dies: whose method, its name, at which call in that process, before or after it."""
 
@@ -51,7 +55,9 @@ def arm(moment: str) -> None:
     """Sees to it that this process dies at that moment."""
     owner, name, call, after = MOMENTS[moment]
     where = {
-        "store": Store,
+        "clips": Clips,
+        "ratings": Ratings,
+        "runs": Runs,
         "snapshot": Snapshot,
         "os": files.os,
         "learner": onedemo.training.learner.Learner,

@@ -116,7 +116,7 @@ def _training_set(quick: bool) -> Growth:
             for size in sizes:
                 _fill(store.path, known, size, segment=pack_segment(segment))
                 known = size
-                training_set, event = TrainingSet(store, _RUN), store.last_event()
+                training_set, event = TrainingSet(store, _RUN), store.ratings.last_event()
                 assert len(training_set.at(event - 10)) == size - 10
                 again.append(_seconds(training_set.at, event))
                 whole.append(_seconds(TrainingSet(store, _RUN).at, event))
@@ -128,13 +128,13 @@ def _training_set(quick: bool) -> Growth:
 
 def _begin(store: Store) -> None:
     """People and iterations, which do not grow with the ratings."""
-    store.add_run(run=_RUN, demo="backflip", demo_sha256="0", seed=0, config="", version="0")
+    store.runs.add(run=_RUN, demo="backflip", demo_sha256="0", seed=0, config="", version="0")
     for number in range(_RATERS):
-        store.ensure_rater(f"rater {number}", "annotator")
-    store.add_token("0" * 64, 1, "session")
+        store.accounts.ensure(f"rater {number}", "annotator")
+    store.accounts.add_token("0" * 64, 1, "session")
     stats = dict.fromkeys(("predicted", "kl", "entropy", "value_loss", "steps_per_s", "true_reward"), 1.2345)
     for number in range(1, _ITERATIONS + 1):
-        store.add_iteration(_RUN, number, snapshot=number, env_steps=4096 * number, stats=stats)
+        store.runs.add_iteration(_RUN, number, snapshot=number, env_steps=4096 * number, stats=stats)
 
 
 def _fill(path: Path, known: int, ratings: int, *, segment: bytes | None = None) -> None:
@@ -153,22 +153,22 @@ def _fill(path: Path, known: int, ratings: int, *, segment: bytes | None = None)
 
 def _ask_all(store: Store, ratings: int) -> None:
     """What a page asks when it opens, tab by tab, and what it asks at a press."""
-    store.rater_of("0" * 64, "session")
-    store.raters()
-    assert sum(store.ratings_by_class(_RUN)) == ratings  # Watch
-    assert len(store.iterations(_RUN)) == _ITERATIONS
-    assert len(store.waiting_clips(_RUN)) == _WAITING  # Rate
-    store.last_event()  # Data
-    assert sum(map(sum, store.tallies(_RUN).values())) == ratings
-    waiting = store.waiting_clips(_RUN)  # a press: the next clip, its picture, the count
-    store.clip(waiting[0].id)
-    store.ratings_by_class(_RUN)
+    store.accounts.rater_of("0" * 64, "session")
+    store.accounts.raters()
+    assert sum(store.ratings.by_class(_RUN)) == ratings  # Watch
+    assert len(store.runs.iterations(_RUN)) == _ITERATIONS
+    assert len(store.clips.waiting(_RUN)) == _WAITING  # Rate
+    store.ratings.last_event()  # Data
+    assert sum(map(sum, store.ratings.tallies(_RUN).values())) == ratings
+    waiting = store.clips.waiting(_RUN)  # a press: the next clip, its picture, the count
+    store.clips.get(waiting[0].id)
+    store.ratings.by_class(_RUN)
 
 
 def _press(store: Store) -> None:
-    clip = store.waiting_clips(_RUN)[0].id
-    store.rate(clip, 1, 3, latency_ms=900)
-    store.undo(clip, 1)
+    clip = store.clips.waiting(_RUN)[0].id
+    store.ratings.rate(clip, 1, 3, latency_ms=900)
+    store.ratings.undo(clip, 1)
 
 
 def _export(directory: Path) -> tuple[float, float]:

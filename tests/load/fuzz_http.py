@@ -81,9 +81,9 @@ def serving(directory: Path):
     front = Front(page, Listening(port=0))
     try:
         url = front.start()
-        rater = trainer.store.ensure_rater("bo", "annotator")
-        trainer.store.set_practised(rater.id)
-        trainer.store.rate(1, rater.id, 4, 900)
+        rater = trainer.store.accounts.ensure("bo", "annotator")
+        trainer.store.accounts.set_practised(rater.id)
+        trainer.store.ratings.rate(1, rater.id, 4, 900)
         yield page, url, issue_link(trainer.store, read_secret(directory), rater, url)
     finally:
         front.close()

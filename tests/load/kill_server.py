@@ -25,7 +25,8 @@ from pathlib import Path
 from load.annotators import browser_session, open_tab, rating
 from load.painted import CHROMIUM_FLAGS, find_chromium
 from load.serving import Server, annotator_link
-from onedemo.storage.store import FILE_NAME, Store
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.store import Store
 
 SETTINGS = [
     "predictor.appearance=false", "ratings.pretrain=30", "ratings.online=1000000", "ratings.rounds=2",

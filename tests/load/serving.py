@@ -23,7 +23,9 @@ from typing import IO
 from aiohttp import ClientSession
 
 from load.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
-from onedemo.storage.store import FILE_NAME, NewClip, Store
+from onedemo.storage.clips import NewClip
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.store import Store
 
 _PATIENCE_S = 900.0
 _IN_HAND = 2
@@ -57,8 +59,8 @@ class Server:
             self.close()
             raise RuntimeError(f"onedemo serve did not start: {said}")
         with closing(Store(data_dir)) as store:  # nobody practises here
-            for rater in store.raters():
-                store.set_practised(rater.id)
+            for rater in store.accounts.raters():
+                store.accounts.set_practised(rater.id)
 
     @staticmethod
     def spawn(
@@ -158,15 +160,15 @@ class Supply:
 
     def __init__(self, store: Store, run: str, count: int) -> None:
         self._store, self._run = store, run
-        drawn = store.waiting_clips(self._run)
+        drawn = store.clips.waiting(self._run)
         pictures = store.path.parent / "runs" / self._run / "clips"
-        segments = {clip.id: store.segment(clip.id) for clip in drawn}
+        segments = {clip.id: store.clips.segment(clip.id) for clip in drawn}
         originals = [drawn[n % len(drawn)] for n in range(count)]
         new = [
             NewClip(demo_step=clip.demo_step, segment=segments[clip.id], stage="online", iteration=1)
             for clip in originals
         ]
-        self._left = [clip.id for clip in store.add_clips(self._run, new)]
+        self._left = [clip.id for clip in store.clips.add(self._run, new)]
         for clip, original in zip(self._left, originals, strict=True):
             os.link(pictures / f"{original.id:06d}.jpg", pictures / f"{clip:06d}.jpg")
 
@@ -176,10 +178,10 @@ class Supply:
         Raises:
             RuntimeError: If there are no more.
         """
-        missing = max(0, queue - len(self._store.waiting_clips(self._run)))
+        missing = max(0, queue - len(self._store.clips.waiting(self._run)))
         if missing > len(self._left):
             raise RuntimeError("more clips were rated than were made")
-        self._store.set_clip_state(self._left[:missing], "ready")
+        self._store.clips.set_state(self._left[:missing], "ready")
         del self._left[:missing]
 
     async def keep(self, queue: int) -> None:
@@ -192,9 +194,9 @@ class Supply:
 def annotator_link(server: Server, store: Store, name: str) -> str:
     """A link for an annotator of that name, as good as one that ``onedemo rater add`` prints."""
     token = secrets.token_urlsafe(32)
-    rater = store.ensure_rater(name, "annotator")
-    store.set_practised(rater.id)
-    store.add_token(hashlib.sha256(token.encode()).hexdigest(), rater.id, "link")
+    rater = store.accounts.ensure(name, "annotator")
+    store.accounts.set_practised(rater.id)
+    store.accounts.add_token(hashlib.sha256(token.encode()).hexdigest(), rater.id, "link")
     return f"{server.base}/login?token={token}"
 
 
@@ -314,13 +316,13 @@ async def stocked(data_dir: Path, *, presses: int, people: int) -> AsyncIterator
         "rollouts.total_steps=1000000000",
     ]  # fmt: skip
     with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
-        before = store.last_event()
+        before = store.ratings.last_event()
         async with browser_session() as session:
             tabs = [await open_tab(session, server.links["annotator"])]
             await give(tabs[0], 10)
             await bring(session, server, "paused")
-            run = store.runs()[-1]["id"]
-            await reach(lambda: store.waiting_clips(run), "clips that are drawn")
+            run = store.runs.all()[-1]["id"]
+            await reach(lambda: store.clips.waiting(run), "clips that are drawn")
             supply = Supply(store, run, int(1.2 * presses) + _IN_HAND * people + 2 * _SPARE)
             yield Stocked(server, store, session, supply, tabs, before)
             for tab in tabs:

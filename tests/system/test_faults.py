@@ -111,7 +111,7 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
     demo = falling_demo(tmp_path / "demo")
     config = small_config(rollouts__total_steps=10**6, ratings__online=200)
     with closing(Store(tmp_path / "data")) as store:
-        ann = store.ensure_rater("Ann", "annotator")
+        ann = store.accounts.ensure("Ann", "annotator")
         trainer = make_trainer(store, demo, config=config)
         trainer.start()
         try:
@@ -125,7 +125,7 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
             assert trainer.status().phase == "online" and trainer.status().ratings == given
         finally:
             trainer.stop()
-        numbers = [row["number"] for row in store.iterations("r")]
+        numbers = [row["number"] for row in store.runs.iterations("r")]
         assert numbers == list(range(1, len(numbers) + 1))
         with closing(sqlite3.connect(store.path)) as db:
             assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
@@ -144,7 +144,7 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
     demo = falling_demo(tmp_path / "demo")
     config = small_config(rollouts__total_steps=10**6, ratings__online=200)
     with closing(Store(tmp_path / "data")) as store:
-        ann = store.ensure_rater("Ann", "annotator")
+        ann = store.accounts.ensure("Ann", "annotator")
         trainer = make_trainer(store, demo, config=config)
         trainer.start()
         try:
@@ -167,9 +167,9 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
 def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium):
     settings = ["predictor.appearance=false", "ratings.queue=4"]
     with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
-        (run,) = (row["id"] for row in store.runs())
-        wait_for(lambda: len(store.waiting_clips(run)) == 4, 60)
-        drawn = {clip.id for clip in store.waiting_clips(run)}
+        (run,) = (row["id"] for row in store.runs.all())
+        wait_for(lambda: len(store.clips.waiting(run)) == 4, 60)
+        drawn = {clip.id for clip in store.clips.waiting(run)}
         server.kill()
         monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))  # no driver is there
         with serving(tmp_path / "data") as server:

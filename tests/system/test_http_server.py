@@ -21,7 +21,8 @@ from onedemo.app.http.server import Front, check_port
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
-from onedemo.storage.store import RATING_COLUMNS, Store
+from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam
 
@@ -167,8 +168,8 @@ def test_unknown_and_revoked_links_are_refused_kindly(site):
     status, _, body, _ = fetch(site.url, "/login?token=wrong")
     assert status == 403
     assert b"This link does not work" in body
-    rater = next(r for r in site.trainer.store.raters() if r.name == "bo")
-    site.trainer.store.revoke_tokens(rater.id)
+    rater = next(r for r in site.trainer.store.accounts.raters() if r.name == "bo")
+    site.trainer.store.accounts.revoke_tokens(rater.id)
     assert fetch(site.url, site.links["annotator"].removeprefix(site.url))[0] == 403
 
 
@@ -191,8 +192,8 @@ def test_clips_of_the_run_and_nothing_else(site):
 
 def test_export_is_for_researchers(site):
     store = site.trainer.store
-    nasty = store.ensure_rater('=HYPERLINK("http://x")', "annotator")
-    store.rate(2, nasty.id, 5, 1200)
+    nasty = store.accounts.ensure('=HYPERLINK("http://x")', "annotator")
+    store.ratings.rate(2, nasty.id, 5, 1200)
     assert fetch(site.url, "/export.csv", link=site.links["annotator"])[0] == 403
     status, headers, body, _ = fetch(site.url, "/export.csv", link=site.links["researcher"])
     assert status == 200
@@ -238,8 +239,8 @@ def test_viser_is_on_the_loopback_only(site):
 
 def test_a_revoked_rater_gets_another_link(site):
     store = site.trainer.store
-    bo = next(r for r in store.raters() if r.name == "bo")
-    store.revoke_tokens(bo.id)
+    bo = next(r for r in store.accounts.raters() if r.name == "bo")
+    store.accounts.revoke_tokens(bo.id)
     again = issue_link(store, read_secret(store.path.parent), bo, site.url)
     assert again != site.links["annotator"]
     assert fetch(site.url, "/", link=again)[0] == 200
@@ -260,7 +261,7 @@ def test_pictures_of_other_data_have_other_addresses(tmp_path):
     for name in ("a", "b"):
         with closing(Store(tmp_path / name)) as store:
             for run in ("r", "s"):
-                store.add_run(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
+                store.runs.add(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
             versions |= {version_of(store, "r"), version_of(store, "s")}
             assert version_of(store, "r") == version_of(store, "r")
         time.sleep(0.002)

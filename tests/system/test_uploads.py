@@ -51,7 +51,7 @@ def visit(store, what, *, role="researcher", **limits):
         try:
             async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
                 if role != "stranger":
-                    rater = store.ensure_rater("a-" + role, role)
+                    rater = store.accounts.ensure("a-" + role, role)
                     link = issue_link(store, read_secret(store.path.parent), rater, url)
                     await session.get(link, allow_redirects=False)
                 return await what(session, url)

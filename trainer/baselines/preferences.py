@@ -209,15 +209,15 @@ def stored_comparisons(store: Store, run: str) -> list[Comparison]:
     Raises:
         UserError: If there is no such run, or nothing was compared in it.
     """
-    runs = [entry["id"] for entry in store.runs()]
+    runs = [entry["id"] for entry in store.runs.all()]
     if run not in runs:
         raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
     preference = {"left": 1.0, "right": 0.0, "equal": 0.5}
-    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.iter_comparisons(run)]
+    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.comparisons.stream(run)]
     if not rows:
         raise UserError(f"nobody has compared anything in run {run!r}; do so on the page's Compare tab")
     return [
-        Comparison(pair=store.pair_segments(row["pair_id"]), preference=preference[row["answer"]])
+        Comparison(pair=store.comparisons.pair_segments(row["pair_id"]), preference=preference[row["answer"]])
         for row in rows
     ]
 

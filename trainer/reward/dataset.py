@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.storage.store import RatedSegment, Rating, Store
+from onedemo.storage.ratings import RatedSegment, Rating
+from onedemo.storage.store import Store
 from onedemo.types import Segment
 
 
@@ -29,15 +30,15 @@ class TrainingSet:
         Only segments of ratings that the last call did not give are read.
 
         Returns:
-            As ``Store.ratings_as_of``, with the segments. Their positions and velocities are left out
+            As ``Store.ratings.for_training``, with the segments. Their positions and velocities are left out
             (``qpos`` and ``qvel`` are (W, 0)).
         """
-        ratings = self._store.ratings_as_of(self._run, event)
+        ratings = self._store.ratings.for_training(self._run, event)
         self._kept = {r.event: self._kept.get(r.event) or self._read(r) for r in ratings}
         return list(self._kept.values())
 
     def _read(self, rating: Rating) -> RatedSegment:
-        whole = self._store.segment(rating.clip)
+        whole = self._store.clips.segment(rating.clip)
         nothing = np.empty((len(whole), 0), np.float32)
         segment = Segment(
             obs=whole.obs.astype(np.float32),

@@ -25,10 +25,10 @@ def newest_snapshot(store: Store, data_dir: Path, run: str) -> Path:
     Raises:
         UserError: If there is no such run, or it has no predictor.
     """
-    runs = [entry["id"] for entry in store.runs()]
+    runs = [entry["id"] for entry in store.runs.all()]
     if run not in runs:
         raise UserError(f"no run {run!r} to start from; there are: {', '.join(runs) or 'none'}")
-    rows = store.snapshots(run)
+    rows = store.runs.snapshots(run)
     if not rows:
         raise UserError(f"run {run!r} has no similarity predictor yet: nothing was rated in it")
     for row in reversed(rows):

@@ -10,8 +10,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 from onedemo.errors import UserError
-from onedemo.storage.audit_log import Audit
-from onedemo.storage.database import now
+from onedemo.storage.database import Database, now
 from onedemo.types import Rater
 
 SESSION_DAYS = 30
@@ -41,16 +40,19 @@ class Link:
 _LINK = f"t.id, p.id, p.name, p.role, t.once, {_STATE}, t.created_at, t.expires_at, t.last_used_at"
 
 
-class People(Audit):
-    """Raters and their tokens."""
+class Accounts:
+    """Raters, their tokens, and who has practised."""
 
-    def ensure_rater(self, name: str, role: str) -> Rater:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def ensure(self, name: str, role: str) -> Rater:
         """The rater of that name, made if there is none.
 
         Raises:
             UserError: If the name belongs to a rater of another role.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             db.execute(
                 "INSERT OR IGNORE INTO raters (name, role, created_at) VALUES (?, ?, ?)",
                 (name, role, now()),
@@ -63,7 +65,7 @@ class People(Audit):
 
     def raters(self) -> list[Rater]:
         """Everybody, in the order they were added."""
-        rows = self.rows("SELECT id, name, role FROM raters ORDER BY id")
+        rows = self._database.rows("SELECT id, name, role FROM raters ORDER BY id")
         return [Rater(id=i, name=n, role=r) for i, n, r in rows]
 
     # Links and sessions
@@ -82,7 +84,7 @@ class People(Audit):
             once: Whether a link opens once.
             link_id: By which link a session came.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             db.execute(
                 "INSERT OR IGNORE INTO tokens (hash, rater_id, kind, link_id, once, created_at, expires_at)"
                 " VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -92,7 +94,7 @@ class People(Audit):
 
     def rater_of(self, token_hash: str, kind: Literal["link", "session"]) -> Rater | None:
         """Whose token that is, or None if it is unknown, revoked, expired or used up."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT p.id, p.name, p.role FROM tokens t JOIN raters p ON p.id = t.rater_id"
             f" WHERE t.hash = :hash AND t.kind = :kind AND {_STATE} = 'open'",
             {"hash": token_hash, "kind": kind, "now": now()},
@@ -114,7 +116,7 @@ class People(Audit):
             token_hash: Of the link.
             session_hash: Of the session's token, which lasts 30 days.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             link = self.link(token_hash)
             if link is None or link.state != "open":
                 return None
@@ -123,15 +125,15 @@ class People(Audit):
             self.add_token(session_hash, link.rater.id, "session", lasts=lasts, link_id=link.id)
         return link
 
-    def came_by(self, session_hash: str) -> int | None:
+    def link_of_session(self, session_hash: str) -> int | None:
         """The number of the link by which a session that holds came, if that is known."""
-        rows = self.rows(
+        rows = self._database.rows(
             f"SELECT t.link_id FROM tokens t WHERE t.hash = :hash AND {_STATE} = 'open'",
             {"hash": session_hash, "now": now()},
         )
         return rows[0][0] if rows else None
 
-    def ended(self, session_hashes: set[str]) -> set[str]:
+    def ended_sessions(self, session_hashes: set[str]) -> set[str]:
         """Which of these sessions do not hold any more."""
         hashes = sorted(session_hashes)
         open_ones: set[str] = set()
@@ -142,12 +144,12 @@ class People(Audit):
                 "SELECT t.hash FROM tokens t"
                 f" WHERE t.hash IN ({places}) AND t.kind = 'session' AND {_STATE} = 'open'"
             )
-            open_ones |= {row[0] for row in self.rows(query, some | {"now": now()})}
+            open_ones |= {row[0] for row in self._database.rows(query, some | {"now": now()})}
         return session_hashes - open_ones
 
     def count_revoked_links(self, rater_id: int) -> int:
         """How many standing links of a rater were revoked: those that neither expire nor open once."""
-        return self.rows(
+        return self._database.rows(
             "SELECT COUNT(*) FROM tokens WHERE rater_id = ? AND kind = 'link' AND revoked_at IS NOT NULL"
             " AND NOT once AND expires_at IS NULL",
             (rater_id,),
@@ -155,7 +157,7 @@ class People(Audit):
 
     def revoke_tokens(self, rater_id: int) -> int:
         """Ends every link and session of a rater; returns how many."""
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             return db.execute(
                 "UPDATE tokens SET revoked_at = ? WHERE rater_id = ? AND revoked_at IS NULL",
                 (now(), rater_id),
@@ -167,7 +169,7 @@ class People(Audit):
         Raises:
             UserError: If there is no such link.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             link = next(iter(self._links("t.id = :id", {"id": link_id})), None)
             if link is None:
                 raise UserError(f"there is no link {link_id}; see `onedemo rater links`")
@@ -179,7 +181,7 @@ class People(Audit):
         return link
 
     def _links(self, where: str, values: dict) -> list[Link]:
-        rows = self.rows(
+        rows = self._database.rows(
             f"SELECT {_LINK} FROM tokens t JOIN raters p ON p.id = t.rater_id"
             f" WHERE t.kind = 'link' AND {where} ORDER BY t.id",
             values | {"now": now()},
@@ -197,7 +199,7 @@ class People(Audit):
     def has_practised(self, rater_id: int) -> bool:
         """Whether a rater has done the practice clips, or rated before there were any."""
         return bool(
-            self.rows(
+            self._database.rows(
                 "SELECT 1 FROM raters WHERE id = ?1 AND (practised_at IS NOT NULL"
                 " OR EXISTS (SELECT 1 FROM events WHERE rater_id = ?1 AND clip_id IS NOT NULL))",
                 (rater_id,),
@@ -206,7 +208,7 @@ class People(Audit):
 
     def set_practised(self, rater_id: int) -> None:
         """Notes that a rater has done the practice clips."""
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             db.execute("UPDATE raters SET practised_at = ? WHERE id = ?", (now(), rater_id))
 
 

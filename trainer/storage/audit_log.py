@@ -10,10 +10,13 @@ AUDIT_COLUMNS = ("at", "who", "what", "detail")
 _LONGEST = 500
 
 
-class Audit(Database):
-    """The log in the database."""
+class AuditLog:
+    """The audit log in the database."""
 
-    def add_audit(self, who: str, what: str, detail: str = "") -> None:
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, who: str, what: str, detail: str = "") -> None:
         """Writes one line.
 
         Args:
@@ -21,15 +24,15 @@ class Audit(Database):
             what: What was done, in the past tense.
             detail: To whom or what; one line, cut after 500 characters.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             db.execute(
                 "INSERT INTO audit (at, who, what, detail) VALUES (?, ?, ?, ?)",
                 (now(), _line(who), what, _line(detail)),
             )
 
-    def audit(self) -> Iterator[tuple[str, str, str, str]]:
+    def lines(self) -> Iterator[tuple[str, str, str, str]]:
         """All lines, oldest first: (at, who, what, detail), streamed."""
-        yield from self.stream("SELECT at, who, what, detail FROM audit ORDER BY id", ())
+        yield from self._database.stream("SELECT at, who, what, detail FROM audit ORDER BY id", ())
 
 
 def _line(text: str) -> str:

@@ -44,12 +44,15 @@ class Pair:
     iteration: int
 
 
-class Pairs(Database):
+class Comparisons:
     """Pairs and what was said of them."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def add_pairs(self, run: str, pairs: Sequence[NewPair]) -> list[Pair]:
         """Stores pairs with their segments, all or none."""
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             added = []
             for pair in pairs:
                 cursor = db.execute(
@@ -69,12 +72,12 @@ class Pairs(Database):
 
     def set_pair_state(self, pair_ids: Sequence[int], state: str) -> None:
         """Moves pairs to "cut" (no picture yet), "ready" (may be shown) or "withdrawn" (too old)."""
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             db.executemany("UPDATE pairs SET state = ? WHERE id = ?", [(state, i) for i in pair_ids])
 
     def waiting_pairs(self, run: str, state: str = "ready") -> list[Pair]:
         """Pairs in that state of which nobody has said anything that holds, oldest first."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT id, demo_step, steps, iteration FROM pairs p WHERE run = ? AND state = ? AND NOT EXISTS ("
             " SELECT 1 FROM comparisons c WHERE c.pair_id = p.id AND c.answer != 'undo' AND NOT EXISTS ("
             "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
@@ -85,7 +88,7 @@ class Pairs(Database):
 
     def pair_run(self, pair_id: int) -> str | None:
         """The run of a pair; None if there is no such pair."""
-        rows = self.rows("SELECT run FROM pairs WHERE id = ?", (pair_id,))
+        rows = self._database.rows("SELECT run FROM pairs WHERE id = ?", (pair_id,))
         return rows[0][0] if rows else None
 
     def pair_segments(self, pair_id: int) -> tuple[Segment, Segment]:
@@ -94,7 +97,7 @@ class Pairs(Database):
         Raises:
             KeyError: If there is no such pair.
         """
-        rows = self.rows("SELECT left_segment, right_segment FROM pairs WHERE id = ?", (pair_id,))
+        rows = self._database.rows("SELECT left_segment, right_segment FROM pairs WHERE id = ?", (pair_id,))
         if not rows:
             raise KeyError(f"no pair {pair_id}")
         return unpack_segment(rows[0][0]), unpack_segment(rows[0][1])
@@ -114,7 +117,7 @@ class Pairs(Database):
         """
         if answer not in (*ANSWERS, "skip", "undo"):
             raise ValueError(f"a pair is {', '.join(ANSWERS)} or skipped, not {answer!r}")
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             rows = db.execute(
                 "SELECT (SELECT answer FROM comparisons WHERE pair_id = p.id AND rater_id = ?"
                 "  ORDER BY id DESC LIMIT 1) FROM pairs p WHERE p.id = ?",
@@ -137,7 +140,7 @@ class Pairs(Database):
 
     def last_compared(self, run: str, rater_id: int) -> int | None:
         """The pair that a rater answered or skipped last in a run, of those that hold, or None."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT c.pair_id FROM comparisons c JOIN pairs p ON p.id = c.pair_id"
             " WHERE c.rater_id = ?1 AND p.run = ?2 AND c.answer != 'undo' AND NOT EXISTS ("
             "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
@@ -146,13 +149,13 @@ class Pairs(Database):
         )
         return rows[0][0] if rows else None
 
-    def count_comparisons(self, run: str) -> int:
+    def count(self, run: str) -> int:
         """How many answers hold in a run."""
-        return self.rows("SELECT COUNT(*) FROM answers WHERE run = ?", (run,))[0][0]
+        return self._database.rows("SELECT COUNT(*) FROM answers WHERE run = ?", (run,))[0][0]
 
-    def iter_comparisons(self, run: str | None = None) -> Iterator[tuple]:
+    def stream(self, run: str | None = None) -> Iterator[tuple]:
         """Rows of the view ``answers`` in order of their number, streamed."""
-        return self.stream(
+        return self._database.stream(
             f"SELECT {', '.join(COMPARISON_COLUMNS)} FROM answers WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
             (run,),
         )

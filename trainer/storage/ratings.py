@@ -73,8 +73,11 @@ class AlreadyAnswered(ValueError):
     """The rater's answer to a clip or pair holds already."""
 
 
-class Answers(Database):
-    """Rating events."""
+class Ratings:
+    """Ratings, skips and undos, and who is left out of training."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
 
     def rate(
         self, clip_id: int, rater_id: int, value: int, latency_ms: int, *,
@@ -126,7 +129,7 @@ class Answers(Database):
         self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int, *,
         mark: tuple[int, int] | None = None, reason: str | None = None, repeat: bool = False,
     ) -> int:  # fmt: skip
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             clip = db.execute(
                 "SELECT c.snapshot, c.predicted, c.steps, (SELECT e.kind || (e.reason IS NOT NULL)"
                 "  FROM events e WHERE e.clip_id = c.id AND e.rater_id = ?1 AND e.repeat = ?2"
@@ -171,7 +174,7 @@ class Answers(Database):
         Returns:
             The event number.
         """
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             cursor = db.execute(
                 "INSERT INTO events (rater_id, kind, run, by_id, snapshot, latency_ms, created_at)"
                 " VALUES (?, ?, ?, ?, 0, 0, ?)",
@@ -182,14 +185,14 @@ class Answers(Database):
 
     def left_out(self, run: str) -> set[int]:
         """Raters whose ratings nothing in a run learns from at present."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT rater_id, kind FROM events WHERE clip_id IS NULL AND run = ? ORDER BY id", (run,)
         )
         return {rater for rater, kind in dict(rows).items() if kind == "leave out"}
 
     def holds(self, clip_id: int, rater_id: int, *, repeat: bool = False) -> bool:
         """Whether a rating or skip of a rater stands on a clip."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT kind FROM events WHERE clip_id = ? AND rater_id = ? AND repeat = ?"
             " ORDER BY id DESC LIMIT 1",
             (clip_id, rater_id, repeat),
@@ -198,7 +201,7 @@ class Answers(Database):
 
     def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
         """The rating or skip that a rater gave last in a run, of those that hold; None if there is none."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
             " JOIN clips c ON c.id = e.clip_id"
             " WHERE e.rater_id = ?1 AND c.run = ?2 AND e.kind IN ('rate', 'skip') AND NOT EXISTS ("
@@ -218,7 +221,7 @@ class Answers(Database):
             most: Events to look back.
             rater_id: Of this rater alone: then so many events of this one.
         """
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT e.clip_id, e.rater_id, e.kind, e.repeat FROM events e JOIN clips c ON c.id = e.clip_id"
             " WHERE c.run = ?1 AND (?2 IS NULL OR e.rater_id = ?2) ORDER BY e.id DESC LIMIT ?3",
             (run, rater_id, most),
@@ -230,9 +233,9 @@ class Answers(Database):
 
     def last_event(self) -> int:
         """Number of the newest event of all runs, 0 if there is none."""
-        return self.rows("SELECT MAX(id) FROM events")[0][0] or 0
+        return self._database.rows("SELECT MAX(id) FROM events")[0][0] or 0
 
-    def ratings_as_of(self, run: str, as_of: int | None = None) -> list[Rating]:
+    def for_training(self, run: str, as_of: int | None = None) -> list[Rating]:
         """What was learned from as of event ``as_of`` (default: now): ratings of a run that held, in order.
 
         Not among them: second opinions, and ratings of raters who were left out.
@@ -241,7 +244,7 @@ class Answers(Database):
         (``TrainingSet`` adds the segments).
         """
         limit = as_of if as_of is not None else 2**62
-        rows = self.stream(
+        rows = self._database.stream(
             "SELECT e.id, e.clip_id, c.demo_step, e.value, e.mark_from, e.mark_to"
             " FROM events e JOIN clips c ON c.id = e.clip_id"
             " WHERE c.run = ?1 AND e.kind = 'rate' AND e.repeat = 0 AND e.id <= ?2 AND NOT EXISTS ("
@@ -254,21 +257,25 @@ class Answers(Database):
         )
         return [Rating(*row[:4], mark=_mark(*row[4:])) for row in rows]
 
-    def ratings_by_class(self, run: str | None = None) -> list[int]:
+    def by_class(self, run: str | None = None) -> list[int]:
         """How many ratings of 1, 2, 3, 4 and 5 hold, in one run or in all."""
         where, values = ("", ()) if run is None else ("WHERE run = ?", (run,))
-        counts = dict(self.rows(f"SELECT value, SUM(ratings) FROM tallies {where} GROUP BY value", values))
+        counts = dict(
+            self._database.rows(f"SELECT value, SUM(ratings) FROM tallies {where} GROUP BY value", values)
+        )
         return [counts.get(value, 0) for value in range(1, 6)]
 
-    def count_learned(self, run: str) -> int:
+    def count_for_training(self, run: str) -> int:
         """How many ratings of a run hold, those of raters who were left out not counted."""
         left_out = self.left_out(run)
-        rows = self.rows("SELECT rater_id, SUM(ratings) FROM tallies WHERE run = ? GROUP BY rater_id", (run,))
+        rows = self._database.rows(
+            "SELECT rater_id, SUM(ratings) FROM tallies WHERE run = ? GROUP BY rater_id", (run,)
+        )
         return sum(ratings for rater, ratings in rows if rater not in left_out)
 
     def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
         """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""
-        rows = self.rows(
+        rows = self._database.rows(
             "SELECT name, stage, value, ratings FROM tallies JOIN raters ON raters.id = rater_id"
             " WHERE run = ? AND ratings > 0 ORDER BY name, stage",
             (run,),
@@ -278,7 +285,7 @@ class Answers(Database):
             counts.setdefault((name, stage), [0] * 5)[value - 1] = ratings
         return counts
 
-    def iter_ratings(self, run: str | None = None, **only: str | int | None) -> Iterator[tuple]:
+    def stream(self, run: str | None = None, **only: str | int | None) -> Iterator[tuple]:
         """Rows of the view ``ratings`` in order of their number, streamed.
 
         Args:
@@ -291,17 +298,17 @@ class Answers(Database):
             raise ValueError(f"ratings have no column {min(unknown)!r}")
         chosen = {name: value for name, value in only.items() if value is not None}
         where = " AND ".join(f"{name} = ?" for name in chosen) or "1"
-        return self.stream(
+        return self._database.stream(
             f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE {where} ORDER BY id",
             tuple(chosen.values()),
         )
 
-    def iter_skips(self, run: str | None = None) -> Iterator[tuple]:
+    def stream_skips(self, run: str | None = None) -> Iterator[tuple]:
         """The skips that hold, in order of their number, streamed: values of ``SKIP_COLUMNS``.
 
         A reason that was said afterwards takes the place of the skip; the time is that of the first press.
         """
-        return self.stream(
+        return self._database.stream(
             "SELECT e.id, e.clip_id, c.run, r.demo, p.name, e.reason, c.stage, c.iteration, e.created_at,"
             " MAX(e.latency_ms, CASE WHEN e.reason IS NULL THEN 0 ELSE COALESCE(("
             "  SELECT f.latency_ms FROM events f WHERE f.clip_id = e.clip_id AND f.rater_id = e.rater_id"
@@ -315,16 +322,16 @@ class Answers(Database):
             (run,),
         )
 
-    def newest_ratings(self, run: str, most: int, columns: Sequence[str]) -> list[tuple]:
+    def newest(self, run: str, most: int, columns: Sequence[str]) -> list[tuple]:
         """Columns of the view ``ratings``, or of events, of the newest ratings of a run, oldest first."""
-        rows = self.rows(
+        rows = self._database.rows(
             f"SELECT {', '.join(columns)} FROM ratings WHERE run = ? ORDER BY id DESC LIMIT ?", (run, most)
         )
         return rows[::-1]
 
-    def restore_rating(self, row: Mapping[str, Any], rater_id: int) -> None:
+    def restore(self, row: Mapping[str, Any], rater_id: int) -> None:
         """Stores a rating of an export as it was: number, time and prediction."""
-        with self.transaction() as db:
+        with self._database.transaction() as db:
             names = ("id", "clip_id", "value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
             db.execute(
                 f"INSERT INTO events (rater_id, kind, {', '.join(names)}, mark_from, mark_to)"

@@ -30,7 +30,7 @@ def save_checkpoint(file: Path, learner: dict[str, Any], row: dict[str, Any], po
     Args:
         file: Where.
         learner: ``Learner.state_dict``.
-        row: What ``Store.add_iteration`` is told.
+        row: What ``Store.runs.add_iteration`` is told.
         pool: Rollouts that clips are still cut from, (N, T); None if nobody is asked any more.
 
     Raises:

@@ -65,16 +65,16 @@ class ClipMaker:
 
     def recover(self, run: str) -> None:
         """After a restart: queues what was cut but never drawn, and what lost its picture or a part of it."""
-        lost = [c for c in self._store.waiting_clips(run) if not read_whole(self._file(c.id), jpeg_fault)]
-        self._store.set_clip_state([c.id for c in lost], "cut")
-        self.submit(self._store.waiting_clips(run, state="cut"))
+        lost = [c for c in self._store.clips.waiting(run) if not read_whole(self._file(c.id), jpeg_fault)]
+        self._store.clips.set_state([c.id for c in lost], "cut")
+        self.submit(self._store.clips.waiting(run, state="cut"))
 
     def _make(self, renderer: Renderer, clip: Clip) -> None:
-        segment = self._store.segment(clip.id)
+        segment = self._store.clips.segment(clip.id)
         index, first = np.unique(self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True)
         agent = renderer.render(segment.qpos[first])
         write_atomic(self._file(clip.id), sealed(compose_clip(self._frames[index], agent)))
-        self._store.set_clip_state([clip.id], "ready")
+        self._store.clips.set_state([clip.id], "ready")
 
     def _note(self, future: Future[None], clip: Clip) -> None:
         if future.cancelled():

@@ -65,15 +65,17 @@ class Pairing:
         """Cuts what is missing from the queue, if somebody looks, and has it drawn."""
         if pool is None or time.monotonic() > self._wanted_until:
             return
-        ready = self._store.waiting_pairs(self._run)
+        ready = self._store.comparisons.waiting_pairs(self._run)
         oldest = learner.iteration - _OLD
         stale = [p.id for p in ready if p.iteration < oldest or not self._file(p.id).exists()]
         if not self._begun:  # a process before this one was to draw them, or has drawn them
-            stale += [p.id for p in self._store.waiting_pairs(self._run, "cut")]
+            stale += [p.id for p in self._store.comparisons.waiting_pairs(self._run, "cut")]
             stale += [p.id for p in ready if not read_whole(self._file(p.id), jpeg_fault)]
             self._begun = True
-        self._store.set_pair_state(stale, "withdrawn")
-        waiting = [p for state in ("ready", "cut") for p in self._store.waiting_pairs(self._run, state)]
+        self._store.comparisons.set_pair_state(stale, "withdrawn")
+        waiting = [
+            p for state in ("ready", "cut") for p in self._store.comparisons.waiting_pairs(self._run, state)
+        ]
         drawn = draw_pairs(
             pool, _QUEUE - len(waiting), learner.clip_steps, learner.demo_steps, self._rng,
             any_time=learner.config.ratings.pairing == "any" and learner.iteration == 0,
@@ -88,7 +90,7 @@ class Pairing:
             )
             for demo_step, left, right in drawn
         ]
-        for pair in self._store.add_pairs(self._run, new):
+        for pair in self._store.comparisons.add_pairs(self._run, new):
             self._submit(pair, learner.frames_of)
 
     def _submit(self, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -96,14 +98,14 @@ class Pairing:
 
     def _make(self, renderer: Renderer, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
         try:
-            left, right = self._store.pair_segments(pair.id)
+            left, right = self._store.comparisons.pair_segments(pair.id)
             index, first = np.unique(frames_of(pair.demo_step + np.arange(pair.steps)), return_index=True)
             robots = [renderer.render(segment.qpos[first]) for segment in (left, right)]
             write_atomic(self._file(pair.id), sealed(compose_clip(self._frames[index], *robots)))
-            self._store.set_pair_state([pair.id], "ready")
+            self._store.comparisons.set_pair_state([pair.id], "ready")
         except Exception:
             log.exception("pair %d could not be drawn", pair.id)
-            self._store.set_pair_state([pair.id], "withdrawn")
+            self._store.comparisons.set_pair_state([pair.id], "withdrawn")
 
 
 _OLD = 10

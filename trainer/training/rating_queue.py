@@ -13,7 +13,8 @@ import numpy as np
 from onedemo.config import RunConfig
 from onedemo.errors import UserError
 from onedemo.reward.model import Snapshot
-from onedemo.storage.store import NewClip, Store
+from onedemo.storage.clips import NewClip
+from onedemo.storage.store import Store
 from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.learner import Learner
 from onedemo.types import Clip, Rollouts, Segment
@@ -70,7 +71,7 @@ class Asking:
 
     def given(self) -> int:
         """Ratings that hold and are learned from."""
-        return self._store.count_learned(self._run)
+        return self._store.ratings.count_for_training(self._run)
 
     def fill(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> None:
         """Cuts clips; in place of those that a simulated rater declines it cuts others.
@@ -87,8 +88,8 @@ class Asking:
         self._declined = 0
         if self._simulated is not None:
             # A process before this one may have died between its questions and the answers.
-            asked = [c for s in ("cut", "ready") for c in self._store.waiting_clips(self._run, s)]
-            self._answer(self._simulated, asked, [self._store.segment(c.id) for c in asked])
+            asked = [c for s in ("cut", "ready") for c in self._store.clips.waiting(self._run, s)]
+            self._answer(self._simulated, asked, [self._store.clips.segment(c.id) for c in asked])
         while self._fill_once(learner, pool, snapshot):
             if self._declined >= _MOST_DECLINED:
                 if learner.iteration == 0 and self._simulated is not None:
@@ -100,16 +101,16 @@ class Asking:
 
     def predict_waiting(self, learner: Learner, snapshot: Snapshot) -> None:
         """Notes what a new snapshot predicts for the clips that wait."""
-        waiting = self._store.waiting_clips(self._run)
-        segments = [(clip, self._store.segment(clip.id)) for clip in waiting]
+        waiting = self._store.clips.waiting(self._run)
+        segments = [(clip, self._store.clips.segment(clip.id)) for clip in waiting]
         predicted = {c.id: learner.predict(snapshot, segment, c.demo_step) for c, segment in segments}
-        self._store.set_predictions(snapshot.number, predicted)
+        self._store.clips.set_predictions(snapshot.number, predicted)
 
     def withdraw_stale(self, iteration: int) -> None:
         """Takes back clips that nobody rated in time: the policy has moved on."""
         oldest = max(1, iteration - self._config.ratings.stale_iterations)
-        stale = [c.id for c in self._store.waiting_clips(self._run) if c.iteration < oldest]
-        self._store.set_clip_state(stale, "withdrawn")
+        stale = [c.id for c in self._store.clips.waiting(self._run) if c.iteration < oldest]
+        self._store.clips.set_state(stale, "withdrawn")
 
     def _fill_once(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> bool:
         """Cuts as many clips as are missing from the queue; True if some still are.
@@ -125,7 +126,7 @@ class Asking:
         if missing <= 0:
             return False
         # Seeded by what was cut before, so that a resumed run asks what the uninterrupted one would.
-        seed = [self._config.seed, learner.iteration, self._store.count_clips(self._run)]
+        seed = [self._config.seed, learner.iteration, self._store.clips.count(self._run)]
         questions = learner.choose(pool, snapshot, missing, np.random.default_rng(seed))
         new = []
         for question in questions:
@@ -145,7 +146,7 @@ class Asking:
                     score=question.score,
                 )
             )
-        clips = self._store.add_clips(self._run, new)
+        clips = self._store.clips.add(self._run, new)
         if self.clips is not None:
             self.clips.submit(clips)
         return self._simulated is not None and self._answer(
@@ -154,7 +155,7 @@ class Asking:
 
     def _missing(self, learner: Learner, snapshot: Snapshot | None) -> int:
         # Waiting is read before given, so that a press in between is missing from neither.
-        waiting = [c for s in ("ready", "cut") for c in self._store.waiting_clips(self._run, s)]
+        waiting = [c for s in ("ready", "cut") for c in self._store.clips.waiting(self._run, s)]
         given = self.given()
         if self._simulated is not None:
             return self._due(learner, snapshot) - given
@@ -163,15 +164,15 @@ class Asking:
 
     def _answer(self, simulated: Simulated, clips: list[Clip], segments: list[Segment]) -> bool:
         """Has clips rated by the simulated rater; whether it declined any."""
-        rater, declined = self._store.ensure_rater(simulated.name, "simulated"), False
+        rater, declined = self._store.accounts.ensure(simulated.name, "simulated"), False
         for clip, segment in zip(clips, segments, strict=True):
             value = simulated.rate(segment, clip.demo_step)
             if value is not None:
                 mark = simulated.mark(segment, clip.demo_step) if simulated.mark else None
-                self._store.rate(clip.id, rater.id, value, latency_ms=0, mark=mark)
+                self._store.ratings.rate(clip.id, rater.id, value, latency_ms=0, mark=mark)
                 self._declined = 0
                 continue
-            self._store.skip(clip.id, rater.id, latency_ms=0)
+            self._store.ratings.skip(clip.id, rater.id, latency_ms=0)
             self._declined, declined = self._declined + 1, True
         return declined
 

@@ -39,7 +39,7 @@ def find_run(
     Raises:
         UserError: If the run has other settings or was made with another video.
     """
-    found = [r for r in store.runs() if (r["id"] == name if name else r["demo"] == demo.name)]
+    found = [r for r in store.runs.all() if (r["id"] == name if name else r["demo"] == demo.name)]
     if not found:
         return None
     run = found[-1]
@@ -110,10 +110,10 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
     if name is not None:
         check_name(name)
     else:
-        taken = {r["id"] for r in store.runs()}
+        taken = {r["id"] for r in store.runs.all()}
         name = next(n for k in count(1) if (n := f"{demo.name}-{k}") not in taken)
     text = to_toml(config)
-    store.add_run(
+    store.runs.add(
         run=name,
         demo=demo.name,
         demo_sha256=demo.sha256,

@@ -63,7 +63,7 @@ def train(
     began = time.monotonic()
     hidden_file = hidden_path(demo.path)
     hidden = load_hidden(hidden_file) if hidden_file.exists() else None
-    given = sum(store.ratings_by_class(name)) if name else 0
+    given = sum(store.ratings.by_class(name)) if name else 0
     budget = config.ratings.pretrain + config.ratings.online
     simulated = make_rater(rater, hidden, demo=demo, budget=budget, given=given, seed=config.seed)
     found = find_run(store, data_dir, demo, name=name, wanted=config) if name else None
@@ -84,7 +84,7 @@ def train(
     learner, snapshot = training.learner, training.snapshot
     assert learner is not None
     oracle = Oracle(hidden, budget=0) if hidden is not None else None
-    by_class = store.ratings_by_class(run)
+    by_class = store.ratings.by_class(run)
     return {
         "run": run,
         "demo": demo.name,

@@ -122,7 +122,7 @@ class TrainingRun:
         # The networks that learn are too small to be split: threads would wait for each other more than
         # they compute, the longer the busier the machine. Their first weights depend on the number, too.
         torch.set_num_threads(1)
-        begun = bool(self.store.snapshots(self.run))
+        begun = bool(self.store.runs.snapshots(self.run))
         start = keep_start(self.files, self._start, begun=begun)
         first = Snapshot.load(start, self.config.device) if start is not None else None
         learner = Learner(self.config, self.demo.frames, self.demo.fps, first)
@@ -197,7 +197,7 @@ class TrainingRun:
 
     def refit(self, at_least: int = 1) -> bool:
         """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
-        event = self.store.last_event()
+        event = self.store.ratings.last_event()
         if event == self._fitted_event or event - self._fitted_event < at_least:
             return False
         ratings = self._training_set.at(event)
@@ -206,7 +206,9 @@ class TrainingRun:
         number = (self.snapshot.number if self.snapshot else 0) + 1
         snapshot, stats = self._opened.fit(ratings, number)
         snapshot.save(self.files.snapshot(number))
-        self.store.add_snapshot(self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats))
+        self.store.runs.add_snapshot(
+            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats)
+        )
         self.snapshot, self._fitted_event = snapshot, event
         self.queue.predict_waiting(self._opened, snapshot)
         return True
@@ -227,7 +229,7 @@ class TrainingRun:
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
         left = self.queue.given() < self.queue.target
         save_checkpoint(self.files.checkpoint, learner.state_dict(), row, rollouts if left else None)
-        self.store.add_iteration(self.run, learner.iteration, **row)
+        self.store.runs.add_iteration(self.run, learner.iteration, **row)
         self.queue.withdraw_stale(learner.iteration)
         self.iteration, self.env_steps = learner.iteration, learner.env_steps
         self.steps_per_s = stats["steps_per_s"]
@@ -280,7 +282,7 @@ class TrainingRun:
 
     def _load_snapshot(self) -> None:
         """The newest snapshot that the database knows and the disk holds whole."""
-        for row in reversed(self.store.snapshots(self.run)):
+        for row in reversed(self.store.runs.snapshots(self.run)):
             file = self.files.snapshot(row["number"])
             if read_whole(file) is not None:
                 self.snapshot = Snapshot.load(file, self.config.device)
@@ -294,5 +296,5 @@ class TrainingRun:
         state, row, self._pool = saved
         learner.load_state_dict(state)
         # The process may have died between the file and the row.
-        self.store.add_iteration(self.run, learner.iteration, **row)
+        self.store.runs.add_iteration(self.run, learner.iteration, **row)
         return True

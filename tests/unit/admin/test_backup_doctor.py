@@ -31,7 +31,8 @@ from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.reward.model import Snapshot
-from onedemo.storage.store import FILE_NAME, Store
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated
 from unit.demos.test_library import make_video
 from unit.training.test_trainer import headless, make_run, work
@@ -87,34 +88,34 @@ def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
     ends = []
     for directory in (data_dir, tmp_path / "again"):
         with closing(Store(directory)) as store:
-            run = store.runs()[0]["id"]
+            run = store.runs.all()[0]["id"]
             rate = Simulated(name="rule", rate=lambda segment, step: 3)
             training = make_run(store, demo, rate, small_config(), name=run)
             work(training)
-            ends.append((training.snapshot.number, store.iterations(run)[-1]["predicted"]))
+            ends.append((training.snapshot.number, store.runs.iterations(run)[-1]["predicted"]))
     assert ends[0] == ends[1] and ends[0][0] > 0
 
 
 def test_ratings_may_come_while_a_backup_is_made(data_dir, tmp_path):
     with closing(Store(data_dir)) as store:
-        clips = [clip.id for clip, _ in store.rated_clips()]
-        before = store.last_event()
+        clips = [clip.id for clip, _ in store.clips.rated()]
+        before = store.ratings.last_event()
         stop = threading.Event()
 
         def keep_rating():
             number = 0
             while not stop.is_set():
-                rater = store.ensure_rater(f"r{number // len(clips)}", "annotator")
-                store.rate(clips[number % len(clips)], rater.id, 4, latency_ms=5)
+                rater = store.accounts.ensure(f"r{number // len(clips)}", "annotator")
+                store.ratings.rate(clips[number % len(clips)], rater.id, 4, latency_ms=5)
                 number += 1
 
         thread = threading.Thread(target=keep_rating)
         thread.start()
         try:
             for number in range(5):
-                acknowledged = store.last_event()
+                acknowledged = store.ratings.last_event()
                 back_up(data_dir, tmp_path / f"{number}.zip")
-                later = store.last_event()
+                later = store.ratings.last_event()
                 restore(tmp_path / f"{number}.zip", tmp_path / f"again-{number}")
                 with closing(sqlite3.connect(tmp_path / f"again-{number}" / FILE_NAME)) as db:
                     (last,) = db.execute("SELECT MAX(id) FROM events").fetchone()
@@ -123,7 +124,7 @@ def test_ratings_may_come_while_a_backup_is_made(data_dir, tmp_path):
         finally:
             stop.set()
             thread.join()
-        assert store.last_event() > before + 10
+        assert store.ratings.last_event() > before + 10
 
 
 @pytest.mark.slow
@@ -132,12 +133,12 @@ def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir
     snapshot = newest(data_dir)
     checkpoint = snapshot.parents[1] / "checkpoint.pt"
     with closing(Store(data_dir)) as store:
-        run = store.runs()[0]["id"]
+        run = store.runs.all()[0]["id"]
 
         def go_on():
             rate = Simulated(name="rule", rate=lambda segment, step: 3)
             work(make_run(store, demo, rate, small_config(), name=run))
-            rows = store.iterations(run)
+            rows = store.runs.iterations(run)
             return [{key: row[key] for key in row.keys() - {"steps_per_s"}} for row in rows]
 
         before, fitted = go_on(), Snapshot.load(snapshot).tensors()

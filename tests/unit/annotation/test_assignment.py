@@ -13,8 +13,9 @@ import pytest
 from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
 from onedemo.app.annotation.rating_session import AnsweredElsewhere, Desk
 from onedemo.config import RatingsConfig, RunConfig
+from onedemo.storage.clips import NewClip
 from onedemo.storage.ratings import Answered
-from onedemo.storage.store import NewClip, Store
+from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Asking
 from onedemo.types import Demo, Segment
 
@@ -75,7 +76,7 @@ def test_shares_are_shares(share):
 @pytest.fixture
 def store(tmp_path):
     store = Store(tmp_path)
-    store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+    store.runs.add(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
     yield store
     store.close()
 
@@ -83,8 +84,8 @@ def store(tmp_path):
 def add_clips(store, count):
     zeros = np.zeros((3, 1))
     segment = Segment(obs=zeros, actions=zeros, qpos=zeros, qvel=zeros)
-    clips = store.add_clips("r", [NewClip(demo_step=0, segment=segment, stage="online", iteration=1)] * count)
-    store.set_clip_state([clip.id for clip in clips], "ready")
+    clips = store.clips.add("r", [NewClip(demo_step=0, segment=segment, stage="online", iteration=1)] * count)
+    store.clips.set_state([clip.id for clip in clips], "ready")
     return [clip.id for clip in clips]
 
 
@@ -106,7 +107,7 @@ def clock():
 
 def make_desk(store, clock, name="bo", assignment=None, **more):
     assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
-    rater = store.ensure_rater(name, "annotator")
+    rater = store.accounts.ensure(name, "annotator")
     return Desk(store, "r", rater, assignment, name, dt=0.01, demo=DEMO, clock=clock, **more)
 
 
@@ -123,7 +124,7 @@ def test_rating_is_in_the_database_before_the_next_clip(desk, store, clock):
     clock.now += 1.5
     assert desk.rate(1, 4)
     assert (desk.current, desk.upcoming) == (2, 3)
-    assert [(row[1], row[5], row[9]) for row in store.iter_ratings()] == [(1, 4, 1500)]
+    assert [(row[1], row[5], row[9]) for row in store.ratings.stream()] == [(1, 4, 1500)]
 
 
 def test_press_for_another_clip_or_too_soon_counts_for_nothing(desk, store, clock):
@@ -133,7 +134,7 @@ def test_press_for_another_clip_or_too_soon_counts_for_nothing(desk, store, cloc
     assert desk.rate(1, 4)
     assert not desk.rate(1, 4)
     assert not desk.rate(2, 4)  # The held key's next repeat.
-    assert store.ratings_by_class() == [0, 0, 0, 1, 0]
+    assert store.ratings.by_class() == [0, 0, 0, 1, 0]
 
 
 def test_undo_brings_clips_back_one_by_one(desk, store, clock):
@@ -150,14 +151,14 @@ def test_undo_brings_clips_back_one_by_one(desk, store, clock):
     clock.now += 1
     assert desk.rate(1, 2)
     assert (desk.current, desk.upcoming) == (2, 3)
-    assert store.ratings_by_class() == [0, 1, 0, 0, 0]
+    assert store.ratings.by_class() == [0, 1, 0, 0, 0]
 
 
 def test_skip_moves_on_without_a_rating(desk, store, clock):
     clock.now += 1
     assert desk.skip(1)
     assert desk.current == 2
-    assert store.ratings_by_class() == [0] * 5
+    assert store.ratings.by_class() == [0] * 5
     assert desk.undo(1)
     assert desk.current == 1 and desk.taken_back.value is None
 
@@ -177,7 +178,7 @@ def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatc
 
     clock.now += 1
     with monkeypatch.context() as patch:
-        patch.setattr(store, "rate", fail)
+        patch.setattr(store.ratings, "rate", fail)
         with pytest.raises(sqlite3.OperationalError):
             desk.rate(1, 3)
     assert desk.current == 1
@@ -217,7 +218,7 @@ def test_a_mark_is_of_the_clip_that_is_rated_and_comes_back_when_it_is_taken_bac
     assert desk.rate(1, 2, (0, 2)) and desk.mark is None
     clock.now += 1
     assert desk.rate(2, 3)
-    assert [row[15:17] for row in store.iter_ratings()] == [(0.0, 0.016), (None, None)]
+    assert [row[15:17] for row in store.ratings.stream()] == [(0.0, 0.016), (None, None)]
     assert desk.undo(2) and desk.mark is None
     assert desk.undo(1) and desk.mark == (0, 2)
 
@@ -234,7 +235,7 @@ def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clo
     clock.now += 1
     desk.rate(3, 3)
     assert not desk.explain(2, "too late")
-    assert store.rows("SELECT clip_id, reason FROM events WHERE kind = 'skip' ORDER BY id") == [
+    assert store.database.rows("SELECT clip_id, reason FROM events WHERE kind = 'skip' ORDER BY id") == [
         (1, None), (1, "dark"), (2, None),
     ]  # fmt: skip
 
@@ -259,7 +260,7 @@ def test_what_was_rated_may_be_taken_back_at_another_page_and_after_a_restart(st
         restarted.refill()
         assert restarted.undoable == 1 and restarted.undo(1)
         assert restarted.undoable is None
-    assert store.ratings_by_class() == [0] * 5
+    assert store.ratings.by_class() == [0] * 5
 
 
 class Always:
@@ -284,8 +285,8 @@ def test_a_shared_clip_is_rated_by_the_second_person_too_and_both_count(store, c
     assert cy.current == 1
     clock.now += 1
     assert cy.rate(1, 5)
-    assert [(row[1], row[4], row[5]) for row in store.iter_ratings()] == [(1, "bo", 4), (1, "cy", 5)]
-    assert [rating.value for rating in store.ratings_as_of("r")] == [4, 5]
+    assert [(row[1], row[4], row[5]) for row in store.ratings.stream()] == [(1, "bo", 4), (1, "cy", 5)]
+    assert [rating.value for rating in store.ratings.for_training("r")] == [4, 5]
     assert cy.current is None  # bo holds the other two, and nothing else is shared
 
 
@@ -304,10 +305,10 @@ def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
     assert desk.current == 1
     clock.now += 1
     assert desk.rate(1, 2)
-    rows = [(row[1], row[5], row[14]) for row in store.iter_ratings()]
+    rows = [(row[1], row[5], row[14]) for row in store.ratings.stream()]
     assert rows[0] == (1, 4, 0) and rows[-1] == (1, 2, 1)
     assert desk.undoable == 1 and desk.undo(1) and desk.current == 1
-    assert [(row[1], row[5], row[14]) for row in store.iter_ratings()] == rows[:-1]
+    assert [(row[1], row[5], row[14]) for row in store.ratings.stream()] == rows[:-1]
 
 
 def test_shares_of_what_is_asked_again_are_as_set():
@@ -318,20 +319,20 @@ def test_shares_of_what_is_asked_again_are_as_set():
 
 
 def test_as_many_clips_come_to_several_people_and_twice_to_one_as_are_meant_to(store, clock):
-    store.rows("PRAGMA synchronous = OFF")
+    store.database.rows("PRAGMA synchronous = OFF")
     add_clips(store, 400)
     assignment = Assignment()
     desks = [
         make_desk(store, clock, name, assignment, rng=random.Random(seed))
         for seed, name in enumerate(("bo", "cy", "di"))
     ]
-    while store.waiting_clips("r"):
+    while store.clips.waiting("r"):
         for desk in desks:
             desk.refill()
             clock.now += 1
             if desk.current is not None:
                 assert desk.rate(desk.current, 3)
-    rows = [(row[1], row[4], row[14]) for row in store.iter_ratings()]
+    rows = [(row[1], row[4], row[14]) for row in store.ratings.stream()]
     firsts = [(clip, rater) for clip, rater, repeat in rows if not repeat]
     repeats = [(clip, rater) for clip, rater, repeat in rows if repeat]
     assert len({clip for clip, _ in firsts}) == 400 and len(set(firsts)) == len(firsts)
@@ -342,13 +343,13 @@ def test_as_many_clips_come_to_several_people_and_twice_to_one_as_are_meant_to(s
 
 def test_clips_that_nobody_rated_in_time_are_taken_back(store):
     ids = add_clips(store, 3)  # all of iteration 1
-    store.rate(ids[0], store.ensure_rater("bo", "annotator").id, 4, 900)
+    store.ratings.rate(ids[0], store.accounts.ensure("bo", "annotator").id, 4, 900)
     config = RunConfig(ratings=RatingsConfig(stale_iterations=10))
     asking = Asking(store, "r", config, None)
     asking.withdraw_stale(11)
-    assert [clip.id for clip in store.waiting_clips("r")] == ids[1:]
+    assert [clip.id for clip in store.clips.waiting("r")] == ids[1:]
     asking.withdraw_stale(12)
-    assert store.waiting_clips("r") == [] and [row[1] for row in store.iter_ratings()] == ids[:1]
+    assert store.clips.waiting("r") == [] and [row[1] for row in store.ratings.stream()] == ids[:1]
 
 
 def test_while_nothing_fresh_waits_nothing_is_asked_again(store, clock):
@@ -382,18 +383,18 @@ def test_a_clip_that_was_rated_at_another_page_of_the_same_person_is_let_go(stor
     assert first.current != 1
     clock.now += 1
     assert first.rate(first.current, 3)
-    assert [row[5] for row in store.iter_ratings()] == [4, 3]
+    assert [row[5] for row in store.ratings.stream()] == [4, 3]
 
 
 def test_repeats_come_however_many_others_rate(store, clock):
     ids = add_clips(store, 60)
-    rater = store.ensure_rater("bo", "annotator").id
+    rater = store.accounts.ensure("bo", "annotator").id
     for clip in ids[:20]:
-        store.rate(clip, rater, 3, 900)
+        store.ratings.rate(clip, rater, 3, 900)
     for number in range(20):
-        other = store.ensure_rater(f"other {number}", "annotator").id
+        other = store.accounts.ensure(f"other {number}", "annotator").id
         for clip in ids[20:50]:
-            store.rate(clip, other, 3, 900)
+            store.ratings.rate(clip, other, 3, 900)
     desk = make_desk(store, clock, "bo", Assignment(), rng=Always("repeated"))
     desk.refill()
     assert desk.current == ids[0]

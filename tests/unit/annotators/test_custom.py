@@ -168,6 +168,6 @@ def test_a_whole_run_on_a_demo_without_hidden_states(taste, tmp_path):
         encoder=Thumbnail(), rater="taste:Height", progress=False,
     )  # fmt: skip
     assert summary["ratings"] == 14 and summary["true_similarity"] is None
-    assert {name for name, _ in store.tallies(summary["run"])} == {"taste:Height"}
-    assert store.count_clips(summary["run"]) == len(sys.modules["taste"].Height.seen) > 14
+    assert {name for name, _ in store.ratings.tallies(summary["run"])} == {"taste:Height"}
+    assert store.clips.count(summary["run"]) == len(sys.modules["taste"].Height.seen) > 14
     store.close()

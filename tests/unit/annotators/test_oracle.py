@@ -157,9 +157,9 @@ def test_declined_clips_are_skipped_and_others_asked(store, tmp_path):
     with closing(sqlite3.connect(store.path)) as db:
         kinds = dict(db.execute("SELECT kind, COUNT(*) FROM events GROUP BY kind").fetchall())
     assert kinds["rate"] == 18 and kinds["skip"] >= 3
-    assert store.count_clips(summary["run"]) == 18 + kinds["skip"]
-    assert not store.waiting_clips(summary["run"], "cut")
-    stages = {key: sum(counts) for key, counts in store.tallies(summary["run"]).items()}
+    assert store.clips.count(summary["run"]) == 18 + kinds["skip"]
+    assert not store.clips.waiting(summary["run"], "cut")
+    stages = {key: sum(counts) for key, counts in store.ratings.tallies(summary["run"]).items()}
     assert stages == {("oracle+skip:0.6", "pretrain"): 12, ("oracle+skip:0.6", "online"): 6}
 
 
@@ -167,7 +167,7 @@ def test_a_rater_that_declines_everything_ends_the_run(store, tmp_path, monkeypa
     monkeypatch.setattr(Oracle, "rate", lambda self, segment, demo_step: None)
     with pytest.raises(UserError, match=r"rater oracle declined 1\d\d clips in a row; without ratings"):
         run(store, falling_demo(tmp_path / "demo"), "oracle")
-    assert sum(store.ratings_by_class()) == 0
+    assert sum(store.ratings.by_class()) == 0
 
 
 @pytest.mark.slow

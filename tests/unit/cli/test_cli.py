@@ -13,8 +13,10 @@ from helpers.paths import ROOT
 from helpers.server_process import Serving
 from onedemo.app.cli.main import _app, main
 from onedemo.config import METHODS, RunConfig, describe, to_toml
+from onedemo.storage.database import FILE_NAME
+from onedemo.storage.ratings import RATING_COLUMNS
 from onedemo.storage.schema import STEPS as SCHEMA
-from onedemo.storage.store import FILE_NAME, RATING_COLUMNS, Store
+from onedemo.storage.store import Store
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.config import load_config
 from onedemo.reward.dataset import TrainingSet
-from onedemo.storage.store import RATING_COLUMNS, Store
+from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
@@ -45,12 +46,12 @@ def study(tmp_path_factory):
         training.prepare()
         while training.step() != "done":
             pass
-        ada, bob = store.ensure_rater("Ada", "researcher"), store.ensure_rater("@Bob | co", "annotator")
-        first = next(clip for clip, _ in store.rated_clips()).id
-        store.rate(first, bob.id, 5, 1200)
-        store.rate(first, bob.id, 4, 900, repeat=True)
-        store.rate(first, ada.id, 1, 700)
-        store.leave_out(run, bob.id, by=ada.id)
+        ada, bob = store.accounts.ensure("Ada", "researcher"), store.accounts.ensure("@Bob | co", "annotator")
+        first = next(clip for clip, _ in store.clips.rated()).id
+        store.ratings.rate(first, bob.id, 5, 1200)
+        store.ratings.rate(first, bob.id, 4, 900, repeat=True)
+        store.ratings.rate(first, ada.id, 1, 700)
+        store.ratings.leave_out(run, bob.id, by=ada.id)
     files = [directory / name for name in ("ratings.csv", "segments.parquet", "card.md")]
     arguments = ["export", "--data-dir", str(data_dir)]
     for option, file in zip(("--out", "--segments", "--card"), files, strict=True):
@@ -69,7 +70,7 @@ def test_the_export_is_what_the_columns_say(study):
     assert table.column_names == list(SEGMENTS)
     assert table.column("clip_id").to_pylist() == sorted({int(row["clip_id"]) for row in rows})
     with closing(Store(data_dir)) as store:
-        clip, segment = next(iter(store.rated_clips()))
+        clip, segment = next(iter(store.clips.rated()))
         row = table.slice(0, 1).to_pylist()[0]
         assert row["clip_id"] == clip.id and np.array_equal(np.array(row["qpos"]), segment.qpos)
 
@@ -80,16 +81,18 @@ def test_imported_into_an_empty_directory_it_gives_the_same_predictor(study, tmp
     assert main(["import", str(ratings), str(segments), "--data-dir", str(again)]) == 0
     fitted = []
     with closing(Store(data_dir)) as before, closing(Store(again)) as after:
-        assert list(after.iter_ratings()) == list(before.iter_ratings())
-        assert [r.role for r in after.raters()] != []
-        assert {r.name: r.role for r in after.raters()} == {r.name: r.role for r in before.raters()}
-        assert after.tallies("first") == before.tallies("first")
+        assert list(after.ratings.stream()) == list(before.ratings.stream())
+        assert [r.role for r in after.accounts.raters()] != []
+        assert {r.name: r.role for r in after.accounts.raters()} == {
+            r.name: r.role for r in before.accounts.raters()
+        }
+        assert after.ratings.tallies("first") == before.ratings.tallies("first")
         assert capsys.readouterr().out.split()[:2] == ["1", "runs"]
         for store, directory in ((before, data_dir), (after, again)):
             config = load_config(directory / "runs" / "first" / "config.toml")
             learner = Learner(config, demo.frames, demo.fps)
             learner.look_at(np.eye(demo.frames, 64, dtype=np.float32), None)
-            rated = TrainingSet(store, "first").at(store.last_event())
+            rated = TrainingSet(store, "first").at(store.ratings.last_event())
             fitted.append((rated, learner.fit(rated, 7)[0].tensors()))
     (one, tensors), (other, same) = fitted
     assert [(r.event, r.value, r.mark) for r in one] == [(r.event, r.value, r.mark) for r in other]
@@ -133,7 +136,7 @@ def test_damaged_exports_get_one_sentence_and_leave_nothing_behind(study, tmp_pa
     assert main(["import", str(file), str(segments), "--data-dir", str(again)]) == 2
     assert sentence in capsys.readouterr().err
     with closing(Store(again)) as store:
-        assert store.runs() == [] and store.last_event() == 0 and store.raters() == []
+        assert store.runs.all() == [] and store.ratings.last_event() == 0 and store.accounts.raters() == []
     assert main(["import", str(ratings), str(segments), "--data-dir", str(again)]) == 0
 
 

@@ -50,11 +50,11 @@ def test_tokens_depend_on_secret_and_rater_and_nothing_else():
 
 def test_only_the_hash_of_a_link_is_stored(tmp_path):
     store = Store(tmp_path)
-    ada = store.ensure_rater("ada", "researcher")
+    ada = store.accounts.ensure("ada", "researcher")
     link = issue_link(store, read_secret(tmp_path), ada, "http://127.0.0.1:8080/")
     token = link.removeprefix("http://127.0.0.1:8080/login?token=")
-    assert store.rater_of(hash_token(token), "link") == ada
-    assert store.rater_of(hash_token(token), "session") is None
+    assert store.accounts.rater_of(hash_token(token), "link") == ada
+    assert store.accounts.rater_of(hash_token(token), "session") is None
     store.close()
     everything = b"".join(p.read_bytes() for p in tmp_path.iterdir() if p.name.startswith("onedemo"))
     assert token.encode() not in everything

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from onedemo.reward.dataset import TrainingSet
+from onedemo.storage.clips import NewClip
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
-from onedemo.storage.store import NewClip, Store
+from onedemo.storage.store import Store
 from onedemo.types import Segment
 
 
@@ -22,11 +23,11 @@ def segment(value):
 @pytest.fixture
 def store(tmp_path):
     store = Store(tmp_path)
-    store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
-    store.ensure_rater("Ann", "annotator")
-    store.ensure_rater("Bob", "annotator")
+    store.runs.add(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+    store.accounts.ensure("Ann", "annotator")
+    store.accounts.ensure("Bob", "annotator")
     new = [NewClip(demo_step=i, segment=segment(i), stage="online", iteration=1) for i in range(12)]
-    store.add_clips("r", new)
+    store.clips.add("r", new)
     yield store
     store.close()
 
@@ -34,8 +35,8 @@ def store(tmp_path):
 @pytest.fixture
 def reads(store, monkeypatch):
     """The clips whose segments were read, in order."""
-    read, real = [], store.segment
-    monkeypatch.setattr(store, "segment", lambda clip: read.append(clip) or real(clip))
+    read, real = [], store.clips.segment
+    monkeypatch.setattr(store.clips, "segment", lambda clip: read.append(clip) or real(clip))
     return read
 
 
@@ -56,13 +57,13 @@ def test_bytes_that_are_no_segment(data):
 
 def test_a_segment_is_read_once_and_kept_in_float32(store, reads):
     training_set = TrainingSet(store, "r")
-    first = store.rate(3, 1, 4, latency_ms=1)
+    first = store.ratings.rate(3, 1, 4, latency_ms=1)
     (rated,) = training_set.at(first)
     assert (rated.event, rated.demo_step, rated.value) == (first, 2, 4)
     np.testing.assert_array_equal(rated.segment.obs, segment(2).obs.astype(np.float32))
     np.testing.assert_array_equal(rated.segment.actions, segment(2).actions)
     assert rated.segment.obs.dtype == rated.segment.actions.dtype == np.float32
-    second = store.rate(5, 1, 2, latency_ms=1)
+    second = store.ratings.rate(5, 1, 2, latency_ms=1)
     assert [r.value for r in training_set.at(second)] == [4, 2]
     assert training_set.at(second)[0] is rated
     assert reads == [3, 5]
@@ -70,12 +71,12 @@ def test_a_segment_is_read_once_and_kept_in_float32(store, reads):
 
 def test_a_rating_taken_back_is_in_no_later_set_but_in_the_earlier_ones(store, reads):
     training_set = TrainingSet(store, "r")
-    before = [store.rate(clip, 1, clip % 5 + 1, latency_ms=1) for clip in (1, 2, 3)][-1]
+    before = [store.ratings.rate(clip, 1, clip % 5 + 1, latency_ms=1) for clip in (1, 2, 3)][-1]
     assert [r.value for r in training_set.at(before)] == [2, 3, 4]
-    after = store.undo(2, 1)
+    after = store.ratings.undo(2, 1)
     assert [r.value for r in training_set.at(after)] == [2, 4]
     assert [r.value for r in training_set.at(before)] == [2, 3, 4]
-    again = store.rate(2, 1, 5, latency_ms=1)
+    again = store.ratings.rate(2, 1, 5, latency_ms=1)
     assert [r.value for r in training_set.at(again)] == [2, 4, 5]
 
 
@@ -86,15 +87,15 @@ def test_the_set_is_the_stores_whatever_was_asked_before(store):
         clip, rater = int(rng.integers(1, 13)), int(rng.integers(1, 3))
         try:
             if rng.random() < 0.5:
-                events.append(store.rate(clip, rater, int(rng.integers(1, 6)), latency_ms=1))
+                events.append(store.ratings.rate(clip, rater, int(rng.integers(1, 6)), latency_ms=1))
             else:
-                events.append(store.undo(clip, rater))
+                events.append(store.ratings.undo(clip, rater))
         except ValueError:
             continue
         as_of = events[int(rng.integers(len(events)))] if rng.random() < 0.3 else events[-1]
         kept = training_set.at(as_of)
         fresh = TrainingSet(store, "r").at(as_of)
-        wanted = store.ratings_as_of("r", as_of=as_of)
+        wanted = store.ratings.for_training("r", as_of=as_of)
         assert [(r.event, r.demo_step, r.value) for r in kept] == [
             (w.event, w.demo_step, w.value) for w in wanted
         ]
@@ -105,10 +106,10 @@ def test_the_set_is_the_stores_whatever_was_asked_before(store):
 
 
 def test_another_runs_ratings_stay_out(store):
-    store.add_run(run="other", demo="d", demo_sha256="0", seed=0, config="", version="0")
-    (clip,) = store.add_clips(
+    store.runs.add(run="other", demo="d", demo_sha256="0", seed=0, config="", version="0")
+    (clip,) = store.clips.add(
         "other", [NewClip(demo_step=0, segment=segment(0), stage="online", iteration=1)]
     )
-    event = store.rate(clip.id, 1, 5, latency_ms=1)
+    event = store.ratings.rate(clip.id, 1, 5, latency_ms=1)
     assert TrainingSet(store, "r").at(event) == []
     assert [r.value for r in TrainingSet(store, "other").at(event)] == [5]

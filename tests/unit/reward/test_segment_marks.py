@@ -16,7 +16,9 @@ from onedemo.reward.segment_marks import (
     split_marks,
     steps_of_pictures,
 )
-from onedemo.storage.store import NewClip, RatedSegment, Store
+from onedemo.storage.clips import NewClip
+from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.store import Store
 from onedemo.types import Demo, Segment
 
 W = 20
@@ -71,9 +73,9 @@ def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
     dt, steps, frames = 0.008, 38, int(8 * fps)
     demo = Demo(name="d", sha256="0", path=tmp_path, fps=fps, frames=frames, width=9, height=9)
     with closing(Store(tmp_path)) as store:
-        store.rows("PRAGMA synchronous = OFF")
-        store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
-        rater = store.ensure_rater("Ann", "annotator").id
+        store.database.rows("PRAGMA synchronous = OFF")
+        store.runs.add(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+        rater = store.accounts.ensure("Ann", "annotator").id
         zeros = {name: np.zeros((steps, n)) for name, n in dict(obs=11, actions=3, qpos=6, qvel=6).items()}
         expected = []
         for demo_step in (0, 1, 2, 3, 101, 930, 962):
@@ -81,13 +83,13 @@ def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
             pictures = np.unique(shown)
             for i, j in ((0, 1), (2, 5), (len(pictures) - 1, len(pictures)), (0, len(pictures))):
                 clip = NewClip(demo_step=demo_step, segment=Segment(**zeros), stage="online", iteration=1)
-                (clip,) = store.add_clips("r", [clip])
+                (clip,) = store.clips.add("r", [clip])
                 of_step = picture_of_step(clip, dt, demo)
                 mark = steps_of_pictures((i, j), of_step)
                 assert pictures_of_steps(mark, of_step) == (i, j)
-                store.rate(clip.id, rater, 2, 900, mark=mark)
+                store.ratings.rate(clip.id, rater, 2, 900, mark=mark)
                 expected.append(np.isin(shown, pictures[i:j]))
-        ratings = TrainingSet(store, "r").at(store.last_event())
+        ratings = TrainingSet(store, "r").at(store.ratings.last_event())
         assert len(ratings) == len(expected) == 28
         for rating, inside in zip(ratings, expected, strict=True):
             assert np.array_equal(marked_steps(rating) > 0, inside)

@@ -11,7 +11,8 @@ from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.sim import kinematics
-from onedemo.storage.store import RatedSegment, Store
+from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run
@@ -254,7 +255,7 @@ def test_a_run_from_a_start_goes_on_without_it(demo, tmp_path):
     whole, parts, plain = (Store(tmp_path / name) for name in ("whole", "parts", "plain"))
     work(begin(whole, demo, by_rule, start))
     work(begin(parts, demo, by_rule, start), iterations=3)
-    assert 3 <= len(parts.iterations("r")) < 6
+    assert 3 <= len(parts.runs.iterations("r")) < 6
     moved = start.with_name("moved.pt")
     start.rename(moved)
     work(begin(parts, demo, by_rule))
@@ -266,7 +267,7 @@ def test_a_run_from_a_start_goes_on_without_it(demo, tmp_path):
     work(begin(plain, demo, by_rule))
     with pytest.raises(UserError, match="has begun without a predictor to start from"):
         work(begin(plain, demo, by_rule, moved))
-    figures = [[row["predicted"] for row in store.iterations("r")] for store in (whole, parts, plain)]
+    figures = [[row["predicted"] for row in store.runs.iterations("r")] for store in (whole, parts, plain)]
     # What the resumed run asked in the iteration that was cut off may differ; all before it may not.
     assert figures[0][:3] == figures[1][:3] and len(figures[1]) == 6
     assert figures[0] != figures[2]

@@ -81,11 +81,11 @@ def test_a_run_starts_from_the_predictor_of_another(study):
     ],
 )
 def test_what_cannot_be_leaves_all_as_it_is(study, fields, words):
-    before, runs = study.trainer, len(study._store.runs())
+    before, runs = study.trainer, len(study._store.runs.all())
     given = {"demo": "falling", "method": "paper", "seed": 0, "name": "new", "predictor_from": None}
     with pytest.raises(UserError, match=words):
         study.create(**given | fields)
-    assert study.trainer is before and len(study._store.runs()) == runs
+    assert study.trainer is before and len(study._store.runs.all()) == runs
     for name, sentence in (("first", "being served already"), ("none", "there are: first, second")):
         with pytest.raises(UserError, match=sentence):
             study.open(name)
@@ -101,12 +101,12 @@ class Served:
 
 
 def test_actions_take_the_fields_they_name_and_no_others(study):
-    ada = study._store.ensure_rater("ada", "researcher")
+    ada = study._store.accounts.ensure("ada", "researcher")
     actions = Actions(Served(study))
     actions.do(ada, {"do": "open run", "run": "second"})
     assert study.trainer.run == "second"
     actions.do(ada, {"do": "leave out", "rater": ada.id})
-    assert study._store.left_out("second") == {ada.id}
+    assert study._store.ratings.left_out("second") == {ada.id}
     for body in (
         None, [], {}, {"do": 1}, {"do": "fly"}, {"do": "open run"}, {"do": "open run", "run": 1},
         {"do": "open run", "run": "a\nb"}, {"do": "open run", "run": "x" * 101},

@@ -34,7 +34,7 @@ def segment(value=0.0, steps=38):
 @pytest.fixture
 def store(tmp_path):
     with closing(Store(tmp_path)) as store:
-        store.add_run(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
+        store.runs.add(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
         yield store
 
 
@@ -44,37 +44,37 @@ def pairs(store):
         NewPair(demo_step=7 * i, left=segment(i), right=segment(-i), stage="online", iteration=3)
         for i in range(4)
     ]
-    ids = [pair.id for pair in store.add_pairs("r", new)]
-    store.set_pair_state(ids, "ready")
+    ids = [pair.id for pair in store.comparisons.add_pairs("r", new)]
+    store.comparisons.set_pair_state(ids, "ready")
     return ids
 
 
 def test_answers_hold_until_they_are_taken_back(store, pairs):
-    ann, bob = (store.ensure_rater(name, "annotator").id for name in ("Ann", "Bob"))
-    store.compare(pairs[0], ann, "left", 900)
-    store.compare(pairs[1], ann, "skip", 900)
-    store.compare(pairs[2], bob, "equal", 900)
-    assert [p.id for p in store.waiting_pairs("r")] == [pairs[3]]
+    ann, bob = (store.accounts.ensure(name, "annotator").id for name in ("Ann", "Bob"))
+    store.comparisons.compare(pairs[0], ann, "left", 900)
+    store.comparisons.compare(pairs[1], ann, "skip", 900)
+    store.comparisons.compare(pairs[2], bob, "equal", 900)
+    assert [p.id for p in store.comparisons.waiting_pairs("r")] == [pairs[3]]
     with pytest.raises(ValueError, match="answered already"):
-        store.compare(pairs[0], ann, "right", 900)
-    store.compare(pairs[0], ann, "undo", 0)
+        store.comparisons.compare(pairs[0], ann, "right", 900)
+    store.comparisons.compare(pairs[0], ann, "undo", 0)
     with pytest.raises(ValueError, match="nothing to take back"):
-        store.compare(pairs[0], ann, "undo", 0)
-    store.compare(pairs[0], ann, "right", 700)
-    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.iter_comparisons("r")]
+        store.comparisons.compare(pairs[0], ann, "undo", 0)
+    store.comparisons.compare(pairs[0], ann, "right", 700)
+    rows = [dict(zip(COMPARISON_COLUMNS, row, strict=True)) for row in store.comparisons.stream("r")]
     assert [(row["pair_id"], row["rater"], row["answer"]) for row in rows] == [
         (pairs[2], "Bob", "equal"), (pairs[0], "Ann", "right"),
     ]  # fmt: skip
-    assert store.count_comparisons("r") == 2 and store.count_comparisons("other") == 0
+    assert store.comparisons.count("r") == 2 and store.comparisons.count("other") == 0
     for answer in ("both", "", None):
         with pytest.raises(ValueError, match="left, right, equal"):
-            store.compare(pairs[3], ann, answer, 0)
+            store.comparisons.compare(pairs[3], ann, answer, 0)
     with pytest.raises(ValueError, match="no pair 99"):
-        store.compare(99, ann, "left", 0)
+        store.comparisons.compare(99, ann, "left", 0)
     for change in ("UPDATE comparisons SET answer = 'left'", "DELETE FROM comparisons"):
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store.rows(change)
-    left, right = store.pair_segments(pairs[1])
+            store.database.rows(change)
+    left, right = store.comparisons.pair_segments(pairs[1])
     assert left.qpos[0, 0] == 1 and right.qpos[0, 0] == -1
 
 
@@ -88,7 +88,7 @@ class Clock:
 def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo, cy = (
-        PairDesk(store, "r", store.ensure_rater(name, "annotator"), assignment, name, clock=clock)
+        PairDesk(store, "r", store.accounts.ensure(name, "annotator"), assignment, name, clock=clock)
         for name in ("bo", "cy")
     )
     bo.refill()
@@ -113,7 +113,7 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
 
 def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):
     clock, assignment = Clock(), Assignment()
-    bo, cy = (store.ensure_rater(name, "annotator") for name in ("bo", "cy"))
+    bo, cy = (store.accounts.ensure(name, "annotator") for name in ("bo", "cy"))
     gone = PairDesk(store, "r", bo, assignment, 1, clock=clock)
     gone.refill()  # and its line breaks without a word
     back = PairDesk(store, "r", bo, assignment, 2, clock=clock)
@@ -123,7 +123,7 @@ def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_aga
     back.refill()
     assert (back.current, back.upcoming) == (pairs[0], pairs[1])
     clock.now += 200
-    late = PairDesk(store, "r", store.ensure_rater("di", "annotator"), assignment, 4, clock=clock)
+    late = PairDesk(store, "r", store.accounts.ensure("di", "annotator"), assignment, 4, clock=clock)
     late.refill()
     assert (late.current, late.upcoming) == (pairs[0], pairs[1])  # the leases have ended
     assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
@@ -131,7 +131,7 @@ def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_aga
 
 def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(store, pairs):
     clock, assignment = Clock(), Assignment()
-    bo = store.ensure_rater("bo", "annotator")
+    bo = store.accounts.ensure("bo", "annotator")
     laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock=clock) for page in ("laptop", "phone"))
     laptop.refill()
     clock.now += 121  # the lease has ended
@@ -144,7 +144,10 @@ def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(s
     assert moved_to not in (None, pairs[0]) and laptop.undoable == pairs[0]
     clock.now += 1
     assert laptop.answer(moved_to, "equal")
-    assert [(row[1], row[5]) for row in store.iter_comparisons()] == [(pairs[0], "left"), (moved_to, "equal")]
+    assert [(row[1], row[5]) for row in store.comparisons.stream()] == [
+        (pairs[0], "left"),
+        (moved_to, "equal"),
+    ]
 
 
 def test_pairs_are_beside_one_moment_of_the_demo_and_no_clip_is_in_two():
@@ -173,18 +176,18 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
     with RenderThread() as drawing:
         pairing = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
         pairing.fill(learner, learner.random_rollouts())
-        assert store.waiting_pairs("r", "cut") == []  # nobody looks
+        assert store.comparisons.waiting_pairs("r", "cut") == []  # nobody looks
         pairing.want()
         pairing.fill(learner, None)
         pairing.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
-        ready = store.waiting_pairs("r")
+        ready = store.comparisons.waiting_pairs("r")
         assert len(ready) == 6
         picture = cv2.imread(str(RunDirectory(tmp_path, "r").pair(ready[0].id)))
         assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
         robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
         assert np.abs(robots[0] - robots[1]).max() > 60
-        left, _ = store.pair_segments(ready[0].id)
+        left, _ = store.comparisons.pair_segments(ready[0].id)
         _, first = np.unique(
             learner.frames_of(ready[0].demo_step + np.arange(ready[0].steps)), return_index=True
         )
@@ -192,7 +195,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         apart = [np.abs(robot[..., ::-1] - drawn.astype(int)).mean() for robot in robots]
         assert apart[0] < 2 < apart[1]  # the left one is on the left
         pairing.fill(learner, learner.random_rollouts())
-        assert len(store.waiting_pairs("r")) == 6  # the queue is full
+        assert len(store.comparisons.waiting_pairs("r")) == 6  # the queue is full
 
         # A process that died: one pair answered, one without its picture, one with a damaged one, one that
         # was still to be drawn.
@@ -200,23 +203,23 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         content = bytearray(RunDirectory(tmp_path, "r").pair(damaged).read_bytes())
         content[len(content) // 2] ^= 1
         RunDirectory(tmp_path, "r").pair(damaged).write_bytes(content)
-        store.compare(answered, store.ensure_rater("Ann", "annotator").id, "left", 900)
+        store.comparisons.compare(answered, store.accounts.ensure("Ann", "annotator").id, "left", 900)
         RunDirectory(tmp_path, "r").pair(lost).unlink()
         new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
-        undrawn = store.add_pairs("r", [new])[0].id
+        undrawn = store.comparisons.add_pairs("r", [new])[0].id
         after = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
         after.want()
         after.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
-        waiting = [pair.id for pair in store.waiting_pairs("r")]
+        waiting = [pair.id for pair in store.comparisons.waiting_pairs("r")]
         assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
         assert all(RunDirectory(tmp_path, "r").pair(pair).exists() for pair in waiting)
-        assert store.waiting_pairs("r", "cut") == [] and store.count_comparisons("r") == 1
+        assert store.comparisons.waiting_pairs("r", "cut") == [] and store.comparisons.count("r") == 1
 
 
 def test_a_policy_learns_from_what_people_compared(store):
     states = falling_states()
-    rater = store.ensure_rater("Ann", "annotator").id
+    rater = store.accounts.ensure("Ann", "annotator").id
     rng = np.random.default_rng(0)
     cuts = [int(t) for t in rng.integers(0, 200, size=40)]
 
@@ -231,8 +234,10 @@ def test_a_policy_learns_from_what_people_compared(store):
         NewPair(demo_step=0, left=cut(a), right=cut(b), stage="pretrain", iteration=0)
         for a, b in zip(cuts[::2], cuts[1::2], strict=True)
     ]
-    for pair, (a, b) in zip(store.add_pairs("r", new), zip(cuts[::2], cuts[1::2], strict=True), strict=True):
-        store.compare(pair.id, rater, "left" if a > b else "right", 900)
+    for pair, (a, b) in zip(
+        store.comparisons.add_pairs("r", new), zip(cuts[::2], cuts[1::2], strict=True), strict=True
+    ):
+        store.comparisons.compare(pair.id, rater, "left" if a > b else "right", 900)
     given = stored_comparisons(store, "r")
     assert [c.preference for c in given] == [float(a > b) for a, b in zip(cuts[::2], cuts[1::2], strict=True)]
     config = PreferencesConfig(
@@ -246,7 +251,7 @@ def test_a_policy_learns_from_what_people_compared(store):
     assert late > early
     for run, words in (("none", "there are: r"), ("q", "nobody has compared")):
         if run == "q":
-            store.add_run(run="q", demo="d", demo_sha256="0", seed=0, config="", version="0")
+            store.runs.add(run="q", demo="d", demo_sha256="0", seed=0, config="", version="0")
         with pytest.raises(UserError, match=words):
             stored_comparisons(store, run)
 
@@ -255,7 +260,7 @@ EARLY, LATE = slice(0, 38), slice(200, 238)
 
 
 def test_comparisons_are_exported(store, pairs, tmp_path):
-    store.compare(pairs[0], store.ensure_rater("=Ann", "annotator").id, "left", 900)
+    store.comparisons.compare(pairs[0], store.accounts.ensure("=Ann", "annotator").id, "left", 900)
     out = tmp_path / "pairs.csv"
     assert main(["export", "--data-dir", str(store.path.parent), "--comparisons", str(out)]) == 0
     with out.open(newline="") as file:

@@ -9,7 +9,8 @@ from load.data import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
 from onedemo.app.dataset.ratings_csv import csv_blocks
 from onedemo.app.ui.data_tab import data_html
-from onedemo.storage.store import RATING_COLUMNS, Store
+from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.store import Store
 
 
 @pytest.fixture
@@ -23,11 +24,11 @@ def store(tmp_path):
 def steps_of(store, work, *values):
     """Instructions that SQLite's virtual machine executes for a piece of work."""
     count = itertools.count()
-    store._db.set_progress_handler(lambda: next(count) and None, 1)
+    store.database._db.set_progress_handler(lambda: next(count) and None, 1)
     try:
         work(*values)
     finally:
-        store._db.set_progress_handler(None, 0)
+        store.database._db.set_progress_handler(None, 0)
     return next(count)
 
 
@@ -40,14 +41,14 @@ def test_the_page_and_a_press_cost_the_same_with_forty_times_the_ratings(store):
     for small, large in zip(before, after, strict=True):
         assert large < 1.2 * small
     # The measure itself: what walks the ratings does grow.
-    assert steps_of(store, store.rows, "SELECT COUNT(*) FROM ratings") > 20_000
+    assert steps_of(store, store.database.rows, "SELECT COUNT(*) FROM ratings") > 20_000
 
 
 def test_a_csv_takes_no_memory_that_grows_with_it(store):
     def peak_and_length():
         tracemalloc.start()
         try:
-            length = sum(len(block) for block in csv_blocks(store.iter_ratings()))
+            length = sum(len(block) for block in csv_blocks(store.ratings.stream()))
             return tracemalloc.get_traced_memory()[1], length
         finally:
             tracemalloc.stop()
@@ -75,12 +76,12 @@ def test_no_ratings_are_a_header():
 def test_the_data_tab_shows_the_tallies(store):
     _fill(store.path, 0, 500)
     rows = rating_rows(store, _RUN)
-    people = {rater.name: rater for rater in store.raters()}
+    people = {rater.name: rater for rater in store.accounts.raters()}
     html = data_html(
-        _RUN, "onedemo", store.tallies(_RUN), quality(rows), quality_by_rater(rows), {}, people, set()
+        _RUN, "onedemo", store.ratings.tallies(_RUN), quality(rows), quality_by_rater(rows), {}, people, set()
     )
     assert "500 ratings" in html
     row = '<th scope="row">rater 3</th><td>pretrain</td>'
-    cells = store.tallies(_RUN)["rater 3", "pretrain"]
+    cells = store.ratings.tallies(_RUN)["rater 3", "pretrain"]
     assert row + "".join(f"<td>{cell or '·'}</td>" for cell in cells) + f"<td><b>{sum(cells)}</b>" in html
     assert sum(cells) == 4

@@ -15,8 +15,9 @@ import pytest
 
 from helpers.paths import DATABASES
 from onedemo.errors import UserError
+from onedemo.storage.database import FILE_NAME
 from onedemo.storage.schema import STEPS
-from onedemo.storage.store import FILE_NAME, Store
+from onedemo.storage.store import Store
 
 STORED = DATABASES
 sys.path.insert(0, str(STORED))
@@ -59,9 +60,9 @@ def test_every_version_is_stored(version):
 def test_every_row_survives_with_its_values(old, version):
     before = read(old)
     with closing(Store(old.parent)) as store:
-        assert store.rows("PRAGMA user_version") == [(len(STEPS),)]
-        assert store.rows("PRAGMA integrity_check") == [("ok",)]
-        assert store.rows("PRAGMA foreign_key_check") == []
+        assert store.database.rows("PRAGMA user_version") == [(len(STEPS),)]
+        assert store.database.rows("PRAGMA integrity_check") == [("ok",)]
+        assert store.database.rows("PRAGMA foreign_key_check") == []
     after = read(old)
     for table, (columns, rows) in before.items():
         if table in COUNTED:
@@ -75,24 +76,30 @@ def test_every_row_survives_with_its_values(old, version):
 
 def test_what_was_said_is_read_and_said_on(old, version):
     with closing(Store(old.parent)) as store:
-        held = [(row[1], row[4], row[5]) for row in store.iter_ratings()]
+        held = [(row[1], row[4], row[5]) for row in store.ratings.stream()]
         expected = [(1, "bo", 5), (1, "ada", 4), (2, "bo", 2), (4, "oracle", 3)]
         assert sorted(held) == sorted(expected + ([(1, "bo", 4)] if version >= 3 else []))
-        assert sum(store.ratings_by_class("hop-1")) == 4  # second opinions are not counted
-        marks = store.rows("SELECT mark_from, mark_to FROM events WHERE mark_from IS NOT NULL")
+        assert sum(store.ratings.by_class("hop-1")) == 4  # second opinions are not counted
+        marks = store.database.rows("SELECT mark_from, mark_to FROM events WHERE mark_from IS NOT NULL")
         assert marks == ([] if version < 3 else [(3, 4)] if version < 6 else [(1, 3)])
-        assert [clip.id for clip in store.waiting_clips("hop-1")] == [5, 6] if version < 3 else [6]
+        assert [clip.id for clip in store.clips.waiting("hop-1")] == [5, 6] if version < 3 else [6]
         for number in range(1, 7):
-            wanted, there = make.segment(number), store.segment(number)
+            wanted, there = make.segment(number), store.clips.segment(number)
             for name in make.SIZES:
                 np.testing.assert_allclose(getattr(there, name), getattr(wanted, name), rtol=1e-6)
-        bo = next(rater for rater in store.raters() if rater.name == "bo")
-        assert store.rater_of("a" * 64, "link") == bo and store.rater_of("c" * 64, "link") is None
-        assert store.snapshots("hop-1")[0]["loss"] == 0.5 and store.iterations("hop-1")[0]["predicted"] == 2.0
-        event = store.rate(6, bo.id, 5, latency_ms=5)
-        store.undo(1, bo.id)
-        assert store.last_event() == event + 1
-        assert sum(store.ratings_by_class("hop-1")) == 4
+        bo = next(rater for rater in store.accounts.raters() if rater.name == "bo")
+        assert (
+            store.accounts.rater_of("a" * 64, "link") == bo
+            and store.accounts.rater_of("c" * 64, "link") is None
+        )
+        assert (
+            store.runs.snapshots("hop-1")[0]["loss"] == 0.5
+            and store.runs.iterations("hop-1")[0]["predicted"] == 2.0
+        )
+        event = store.ratings.rate(6, bo.id, 5, latency_ms=5)
+        store.ratings.undo(1, bo.id)
+        assert store.ratings.last_event() == event + 1
+        assert sum(store.ratings.by_class("hop-1")) == 4
 
 
 def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_path):
@@ -112,11 +119,11 @@ def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_pa
                 (number, round(first * 0.008, 6), round(after * 0.008, 6)),
             )
     with closing(Store(tmp_path)) as store:
-        assert [r.mark for r in store.ratings_as_of("hop-1") if r.clip >= 100] == marks
-        seconds = [(row[15], row[16]) for row in store.iter_ratings() if row[1] >= 100]
+        assert [r.mark for r in store.ratings.for_training("hop-1") if r.clip >= 100] == marks
+        seconds = [(row[15], row[16]) for row in store.ratings.stream() if row[1] >= 100]
         assert seconds == [(round(first * 0.008, 6), round(after * 0.008, 6)) for first, after in marks]
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store.rows("UPDATE events SET mark_from = 0")
+            store.database.rows("UPDATE events SET mark_from = 0")
 
 
 def test_a_newer_database_is_refused_and_not_touched(tmp_path):
@@ -152,7 +159,7 @@ def test_a_migration_that_is_killed_leaves_a_whole_version(tmp_path):
             assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
             seen.add(db.execute("PRAGMA user_version").fetchone()[0])
         with closing(Store(directory)) as store:
-            assert len(list(store.iter_ratings())) == 4
+            assert len(list(store.ratings.stream())) == 4
     assert seen <= set(range(1, len(STEPS) + 1))
 
 

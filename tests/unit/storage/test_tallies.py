@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from onedemo.storage import schema
+from onedemo.storage.clips import NewClip
+from onedemo.storage.database import FILE_NAME
 from onedemo.storage.schema import STEPS, migrate
-from onedemo.storage.store import FILE_NAME, NewClip, Store
+from onedemo.storage.store import Store
 from onedemo.types import Segment
 
 RUNS = ("first", "second")
@@ -38,30 +40,30 @@ def assert_kept_as_the_events_say(store):
             truth = {}
             for rater, stage, value, count in db.execute(_TALLIES, (run,)):
                 truth.setdefault((rater, stage), [0] * 5)[value - 1] = count
-            assert store.tallies(run) == truth
-            assert store.ratings_by_class(run) == [sum(row[v] for row in truth.values()) for v in range(5)]
+            assert store.ratings.tallies(run) == truth
+            assert store.ratings.by_class(run) == [sum(row[v] for row in truth.values()) for v in range(5)]
             for state in STATES:
                 waiting = [clip for (clip,) in db.execute(_WAITING, (run, state))]
-                assert [clip.id for clip in store.waiting_clips(run, state)] == waiting
+                assert [clip.id for clip in store.clips.waiting(run, state)] == waiting
             (clips,) = db.execute("SELECT COUNT(*) FROM clips WHERE run = ?", (run,)).fetchone()
-            assert store.count_clips(run) == clips
+            assert store.clips.count(run) == clips
         answers = db.execute(_ANSWERS).fetchall()
         assert db.execute("SELECT id, answers FROM clips ORDER BY id").fetchall() == answers
-        assert sum(store.ratings_by_class()) == db.execute("SELECT COUNT(*) FROM ratings").fetchone()[0]
+        assert sum(store.ratings.by_class()) == db.execute("SELECT COUNT(*) FROM ratings").fetchone()[0]
 
 
 def add_clips(store, run, count, stage):
     rows = np.zeros((38, 11)), np.zeros((38, 3)), np.zeros((38, 6)), np.zeros((38, 6))
     segment = Segment(**dict(zip(("obs", "actions", "qpos", "qvel"), rows, strict=True)))
-    return store.add_clips(run, [NewClip(demo_step=0, segment=segment, stage=stage, iteration=0)] * count)
+    return store.clips.add(run, [NewClip(demo_step=0, segment=segment, stage=stage, iteration=0)] * count)
 
 
 @pytest.fixture
 def store(tmp_path):
     store = Store(tmp_path)
-    store.rows("PRAGMA synchronous = OFF")  # thousands of commits
+    store.database.rows("PRAGMA synchronous = OFF")  # thousands of commits
     for run in RUNS:
-        store.add_run(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
+        store.runs.add(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
     yield store
     store.close()
 
@@ -69,7 +71,7 @@ def store(tmp_path):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_after_thousands_of_presses_of_several_raters(store, seed):
     rng = np.random.default_rng(seed)
-    raters = [store.ensure_rater(name, "annotator").id for name in ("Ann", "Bob", "Cy", "'; DROP TABLE")]
+    raters = [store.accounts.ensure(name, "annotator").id for name in ("Ann", "Bob", "Cy", "'; DROP TABLE")]
     clips, done = [], {"rate": 0, "skip": 0, "undo": 0, "refused": 0}
     for step in range(3000):
         if step % 60 == 0:
@@ -79,13 +81,13 @@ def test_after_thousands_of_presses_of_several_raters(store, seed):
         kind = ("rate", "rate", "skip", "undo", "undo", "state")[int(rng.integers(6))]
         try:
             if kind == "rate":
-                store.rate(clip, rater, int(rng.integers(1, 6)), latency_ms=1)
+                store.ratings.rate(clip, rater, int(rng.integers(1, 6)), latency_ms=1)
             elif kind == "skip":
-                store.skip(clip, rater, latency_ms=1)
+                store.ratings.skip(clip, rater, latency_ms=1)
             elif kind == "undo":
-                store.undo(clip, rater)
+                store.ratings.undo(clip, rater)
             else:
-                store.set_clip_state([clip], STATES[int(rng.integers(3))])
+                store.clips.set_state([clip], STATES[int(rng.integers(3))])
                 continue
         except ValueError:  # rated already, or nothing to take back
             kind = "refused"
@@ -98,12 +100,12 @@ def test_after_events_that_the_store_would_refuse(store):
     """Another program may write a second rating over a first, or an undo of nothing."""
     rng = np.random.default_rng(3)
     for name in ("Ann", "Bob"):
-        store.ensure_rater(name, "annotator")
+        store.accounts.ensure(name, "annotator")
     clips = add_clips(store, RUNS[0], 2, "pretrain") + add_clips(store, RUNS[1], 2, "online")
     for _ in range(300):
         kind = ("rate", "skip", "undo")[int(rng.integers(3))]
         value = int(rng.integers(1, 6)) if kind == "rate" else None
-        store.rows(
+        store.database.rows(
             "INSERT INTO events (clip_id, rater_id, kind, value, snapshot, latency_ms, created_at)"
             " VALUES (?, ?, ?, ?, 0, 0, '')",
             (clips[int(rng.integers(4))].id, int(rng.integers(1, 3)), kind, value),
@@ -112,16 +114,16 @@ def test_after_events_that_the_store_would_refuse(store):
 
 
 def test_a_press_that_fails_counts_for_nothing(store):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     (clip,) = add_clips(store, RUNS[0], 1, "pretrain")
-    with pytest.raises(RuntimeError), store.transaction() as db:
+    with pytest.raises(RuntimeError), store.database.transaction() as db:
         db.execute(
             "INSERT INTO events (clip_id, rater_id, kind, value, snapshot, latency_ms, created_at)"
             " VALUES (?, ?, 'rate', 4, 0, 0, '')",
             (clip.id, ann.id),
         )
         raise RuntimeError
-    assert sum(store.ratings_by_class()) == 0
+    assert sum(store.ratings.by_class()) == 0
     assert_kept_as_the_events_say(store)
 
 
@@ -169,15 +171,17 @@ def test_a_database_of_the_first_version_is_migrated_with_all_it_holds(tmp_path)
     ratings = first_version(tmp_path)
     assert len(ratings) > 20
     with closing(Store(tmp_path)) as store:
-        assert store.rows("PRAGMA user_version") == [(len(STEPS),)]
-        assert [row[: len(ratings[0])] for row in store.iter_ratings()] == [tuple(row) for row in ratings]
+        assert store.database.rows("PRAGMA user_version") == [(len(STEPS),)]
+        assert [row[: len(ratings[0])] for row in store.ratings.stream()] == [tuple(row) for row in ratings]
         assert_kept_as_the_events_say(store)
-        assert store.segment(3).obs[0, 0] == 0.1 and store.segment(3).actions.dtype == np.float32
-        for clip in store.waiting_clips(RUNS[0]):
-            store.rate(clip.id, 1, 5, latency_ms=1)
-        store.undo(ratings[0][1], next(r.id for r in store.raters() if r.name == ratings[0][4]))
+        assert store.clips.segment(3).obs[0, 0] == 0.1 and store.clips.segment(3).actions.dtype == np.float32
+        for clip in store.clips.waiting(RUNS[0]):
+            store.ratings.rate(clip.id, 1, 5, latency_ms=1)
+        store.ratings.undo(
+            ratings[0][1], next(r.id for r in store.accounts.raters() if r.name == ratings[0][4])
+        )
         assert_kept_as_the_events_say(store)
-        assert store.rows("PRAGMA foreign_key_check") == []
+        assert store.database.rows("PRAGMA foreign_key_check") == []
 
 
 def test_two_processes_may_open_an_old_database_at_once(tmp_path):

@@ -79,8 +79,8 @@ def wait_for(condition, seconds=30.0):
 
 def rate_all(store, run, rater, value=3):
     for state in ("cut", "ready"):
-        for clip in store.waiting_clips(run, state):
-            store.rate(clip.id, rater.id, value, latency_ms=5)
+        for clip in store.clips.waiting(run, state):
+            store.ratings.rate(clip.id, rater.id, value, latency_ms=5)
 
 
 def headless(store, demo):
@@ -106,7 +106,7 @@ def test_a_headless_run_gives_its_summary(store, demo):
         assert summary[key]["worst"] <= summary[key]["mean"] <= summary[key]["best"], key
     assert 1 <= summary["predicted_similarity"]["worst"] <= summary["predicted_similarity"]["best"] <= 5
     assert {"steps_per_s", "wall_s", "seed", "version"} <= summary.keys()
-    iterations = store.iterations(summary["run"])
+    iterations = store.runs.iterations(summary["run"])
     assert [row["number"] for row in iterations] == [1, 2, 3, 4, 5, 6]
     assert "true_reward" in iterations[0] and iterations[0]["kl"] <= 0.05
 
@@ -114,13 +114,13 @@ def test_a_headless_run_gives_its_summary(store, demo):
 def test_every_reward_can_be_traced_to_ratings(store, demo):
     summary = headless(store, demo)
     run = summary["run"]
-    snapshots = {row["number"]: row for row in store.snapshots(run)}
-    for iteration in store.iterations(run):
+    snapshots = {row["number"]: row for row in store.runs.snapshots(run)}
+    for iteration in store.runs.iterations(run):
         snapshot = snapshots[iteration["snapshot"]]
-        ratings = store.ratings_as_of(run, as_of=snapshot["last_event"])
+        ratings = store.ratings.for_training(run, as_of=snapshot["last_event"])
         assert len(ratings) == snapshot["ratings"] >= 12
         assert (store.path.parent / "runs" / run / "snapshots" / f"{iteration['snapshot']:06d}.pt").exists()
-    stages = [row[6] for row in store.iter_ratings(run)]
+    stages = [row[6] for row in store.ratings.stream(run)]
     assert stages.count("pretrain") == 12 and stages.count("online") == 6
 
 
@@ -131,7 +131,7 @@ def test_the_same_seed_gives_the_same_run(demo, tmp_path):
         torch.set_num_threads(threads)  # what the process had before must not matter
         store = Store(tmp_path / name)
         work(make_run(store, demo, Simulated(name="rule", rate=by_rule)))
-        rows = store.iterations("r")
+        rows = store.runs.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()
     assert curves[0] == curves[1] and len(curves[0]) == 6
@@ -139,20 +139,20 @@ def test_the_same_seed_gives_the_same_run(demo, tmp_path):
 
 def test_a_stopped_run_goes_on_where_it_was(store, demo):
     work(make_run(store, demo, Simulated(name="rule", rate=by_rule)), iterations=3)
-    before = store.iterations("r")
+    before = store.runs.iterations("r")
     assert len(before) == 3
     work(make_run(store, demo, Simulated(name="rule", rate=by_rule)))
-    after = store.iterations("r")
+    after = store.runs.iterations("r")
     assert after[: len(before)] == before
     assert [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
-    assert after[-1]["env_steps"] == 2400 and sum(store.ratings_by_class("r")) == 18
-    numbers = [row["number"] for row in store.snapshots("r")]
+    assert after[-1]["env_steps"] == 2400 and sum(store.ratings.by_class("r")) == 18
+    numbers = [row["number"] for row in store.runs.snapshots("r")]
     assert numbers == list(range(1, len(numbers) + 1))
 
 
 @pytest.mark.slow
 def test_people_rate_and_the_trainer_follows(store, demo):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     trainer_ = make_trainer(store, demo, config=small_config(rollouts__total_steps=10**6))
     trainer_.start()
     wait_for(lambda: trainer_.status().phase == "pretrain")
@@ -161,16 +161,16 @@ def test_people_rate_and_the_trainer_follows(store, demo):
         (thread,) = [t for t in threading.enumerate() if t.name == "trainer"]
         assert os.getpriority(os.PRIO_PROCESS, thread.native_id) > os.getpriority(os.PRIO_PROCESS, 0)
     for _ in range(4):
-        wait_for(lambda: store.waiting_clips("r", "cut"))
-        assert len(store.waiting_clips("r", "cut")) <= 4  # the queue is not longer than asked
+        wait_for(lambda: store.clips.waiting("r", "cut"))
+        assert len(store.clips.waiting("r", "cut")) <= 4  # the queue is not longer than asked
         rate_all(store, "r", ann)
         if trainer_.status().phase == "online":
             break
     wait_for(lambda: trainer_.status().iteration >= 2)
-    fitted = store.snapshots("r")[-1]["last_event"]
-    wait_for(lambda: store.waiting_clips("r", "cut"))
+    fitted = store.runs.snapshots("r")[-1]["last_event"]
+    wait_for(lambda: store.clips.waiting("r", "cut"))
     rate_all(store, "r", ann, value=5)
-    wait_for(lambda: store.snapshots("r")[-1]["last_event"] > fitted)
+    wait_for(lambda: store.runs.snapshots("r")[-1]["last_event"] > fitted)
     trainer_.pause()
     wait_for(lambda: trainer_.status().phase == "paused")
     iterations = trainer_.status().iteration
@@ -184,11 +184,13 @@ def test_people_rate_and_the_trainer_follows(store, demo):
     trainer_.resume()  # from its checkpoint
     wait_for(lambda: trainer_.status().iteration > iterations)
     trainer_.stop()
-    assert [row["number"] for row in store.iterations("r")] == list(range(1, trainer_.status().iteration + 1))
+    assert [row["number"] for row in store.runs.iterations("r")] == list(
+        range(1, trainer_.status().iteration + 1)
+    )
 
 
 def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypatch):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     trainer_ = make_trainer(
         store, demo, config=small_config(rollouts__total_steps=10**6, ratings__online=200)
     )
@@ -202,7 +204,7 @@ def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypa
         wait_for(lambda: rate_all(store, "r", ann) or trainer_.status().phase == "failed")
         assert trainer_.status().error == "FloatingPointError: the policy has exploded"
         given = trainer_.status().ratings
-        wait_for(lambda: store.waiting_clips("r", "cut"))
+        wait_for(lambda: store.clips.waiting("r", "cut"))
         rate_all(store, "r", ann)
         assert trainer_.status().ratings > given
     trainer_.resume()
@@ -228,7 +230,7 @@ def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, de
     with ExitStack() as held:
         held.enter_context(hold(training.files.lock))
         trainer_ = Trainer(training, held.pop_all())
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     trainer_.start()
     wait_for(lambda: rate_all(store, "r", ann) or (trainer_.status().phase == "online"))
     wait_for(lambda: trainer_.status().snapshot == 1)
@@ -257,7 +259,7 @@ def test_after_a_stop_that_timed_out_one_thread_follows_the_other(store, demo, m
         working.pop()
 
     monkeypatch.setattr(TrainingRun, "iterate", slow)
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     held = ExitStack()
     freed = []
     held.callback(lambda: freed.append(len(working)))
@@ -286,7 +288,7 @@ def few_wild(monkeypatch):
 
 @pytest.mark.slow
 def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monkeypatch, few_wild):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     looked = threading.Event()
 
     def look(env, encoder, cache_dir, check):
@@ -301,10 +303,10 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
     trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
     trainer_.start()
     for _ in range(3):
-        wait_for(lambda: store.waiting_clips("r", "cut"))
+        wait_for(lambda: store.clips.waiting("r", "cut"))
         rate_all(store, "r", ann)
     assert trainer_.status().phase == "starting" and trainer_.status().ratings >= 9
-    assert trainer_.acting() is None and not store.snapshots("r")
+    assert trainer_.acting() is None and not store.runs.snapshots("r")
     trainer_.stop(timeout_s=10)
     assert trainer_.status().phase == "stopped"
     trainer_.resume()
@@ -316,7 +318,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
 
 @pytest.mark.slow
 def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     config = small_config(
         method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
     )
@@ -328,8 +330,10 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
     assert before is not None and type(before.rules) is EpisodeRules  # nothing says what is alike
 
     def rate_some():
-        for clip in store.waiting_clips("r", "cut"):
-            store.rate(clip.id, ann.id, by_rule(store.segment(clip.id), clip.demo_step), latency_ms=5)
+        for clip in store.clips.waiting("r", "cut"):
+            store.ratings.rate(
+                clip.id, ann.id, by_rule(store.clips.segment(clip.id), clip.demo_step), latency_ms=5
+            )
         return trainer_.status().iteration >= 2
 
     wait_for(rate_some, seconds=60)
@@ -356,34 +360,34 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
 
 @pytest.mark.slow
 def test_clips_for_people_are_chosen_a_few_at_a_time(store, demo):
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     trainer_ = make_trainer(store, demo, config=small_config(ratings__queue=12, ratings__pretrain=100))
     trainer_.start()
-    wait_for(lambda: trainer_.status().phase == "pretrain" and len(store.waiting_clips("r", "cut")) == 12)
-    for clip in store.waiting_clips("r", "cut")[:3]:
-        store.rate(clip.id, ann.id, 3, latency_ms=5)
+    wait_for(lambda: trainer_.status().phase == "pretrain" and len(store.clips.waiting("r", "cut")) == 12)
+    for clip in store.clips.waiting("r", "cut")[:3]:
+        store.ratings.rate(clip.id, ann.id, 3, latency_ms=5)
     time.sleep(1.0)
-    assert len(store.waiting_clips("r", "cut")) == 9
-    store.rate(store.waiting_clips("r", "cut")[0].id, ann.id, 3, latency_ms=5)
-    wait_for(lambda: len(store.waiting_clips("r", "cut")) == 12)
+    assert len(store.clips.waiting("r", "cut")) == 9
+    store.ratings.rate(store.clips.waiting("r", "cut")[0].id, ann.id, 3, latency_ms=5)
+    wait_for(lambda: len(store.clips.waiting("r", "cut")) == 12)
     trainer_.stop()
 
 
 def test_every_rating_asked_for_can_be_given(store, demo):
     """However few are left: a queue that is filled a few at a time must not keep the last ones back."""
-    ann = store.ensure_rater("Ann", "annotator")
+    ann = store.accounts.ensure("Ann", "annotator")
     trainer_ = make_trainer(
         store, demo, config=small_config(ratings__queue=12, ratings__pretrain=30, ratings__online=0)
     )
     trainer_.start()
 
     def rate_one():
-        for clip in store.waiting_clips("r", "cut")[:1]:
-            store.rate(clip.id, ann.id, 3, latency_ms=5)
+        for clip in store.clips.waiting("r", "cut")[:1]:
+            store.ratings.rate(clip.id, ann.id, 3, latency_ms=5)
         return trainer_.status().ratings == 30
 
     wait_for(rate_one, seconds=60)
-    assert not store.waiting_clips("r", "cut")
+    assert not store.clips.waiting("r", "cut")
     trainer_.stop()
 
 
@@ -391,14 +395,14 @@ def test_a_run_of_before_there_were_methods_goes_on(store, demo):
     """Its config names no method, its snapshots hold one network, its checkpoint no rules."""
     first = make_run(store, demo, Simulated(name="rule", rate=by_rule))
     work(first, iterations=3)
-    before = store.iterations("r")
+    before = store.runs.iterations("r")
     as_of_before(first.files.path)
     found = find_run(store, store.path.parent, demo, name="r", wanted=None)
     assert found is not None and found[1] == small_config()
     second = make_run(store, demo, Simulated(name="rule", rate=by_rule))
     assert Trainer(second).status().method == "paper"
     work(second)
-    after = store.iterations("r")
+    after = store.runs.iterations("r")
     assert after[: len(before)] == before and [row["number"] for row in after] == [1, 2, 3, 4, 5, 6]
 
 
@@ -531,7 +535,7 @@ def learns_the_same_from_noise(demo, tmp_path, config):
             learner, snapshot = watched_run(store, demo, config)
             ends.append((learner, snapshot))
             arrays.append([*learner.policy().weights, learner.policy().mean, *flat(snapshot.tensors())])
-            asked.append([store.clip(i) for i in range(1, store.count_clips("r") + 1)])
+            asked.append([store.clips.get(i) for i in range(1, store.clips.count("r") + 1)])
             store.close()
     finally:
         save_hidden(file, truth)
@@ -589,9 +593,9 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
         store = Store(tmp_path / name)
         if name == "stopped":
             work(make_run(store, demo, rater, config=config, encoder=Mixed()), iterations=2)
-            assert len(store.iterations("r")) == 2
+            assert len(store.runs.iterations("r")) == 2
         work(make_run(store, demo, rater, config=config, encoder=Mixed()))
-        rows = store.iterations("r")
+        rows = store.runs.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()
     assert len(curves[0]) == 4
