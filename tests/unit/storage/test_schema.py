@@ -60,7 +60,7 @@ def stored(tmp_path):
 
 def _copy(directory):
     directory.mkdir()
-    shutil.copy(STORED / f"v{min(STEPS)}.sqlite3", directory / FILE_NAME)
+    shutil.copy(STORED / f"v{NEXT - 1}.sqlite3", directory / FILE_NAME)
     return directory
 
 
