@@ -153,7 +153,7 @@ def _check_database(path: Path, file: Path) -> int:
             (said,) = db.execute("PRAGMA integrity_check(1)").fetchone()
             (ratings,) = db.execute("SELECT COUNT(*) FROM ratings").fetchone()
     except ValueError as error:
-        raise UserError(f"{file} was saved by a newer onedemo ({error}); update onedemo first") from None
+        raise UserError(f"the database in {file} was {error}") from None
     except sqlite3.DatabaseError as error:
         said, ratings = str(error), 0
     if said != "ok":

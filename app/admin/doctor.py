@@ -144,7 +144,7 @@ def _database(data_dir: Path) -> Iterator[Finding]:
         try:
             version = check_version(db)
         except ValueError as error:
-            yield Finding("database", False, f"{path} is of a newer onedemo ({error}): update onedemo")
+            yield Finding("database", False, f"{path} was {error}")
             return
         said = [line for (line,) in db.execute("PRAGMA integrity_check(5)")]
         if said != ["ok"]:
@@ -159,8 +159,8 @@ def _database(data_dir: Path) -> Iterator[Finding]:
             return
         (ratings,) = db.execute("SELECT COUNT(*) FROM ratings").fetchone()
     schema = f"schema {version}"
-    if version < len(STEPS):
-        schema += f", which is brought to {len(STEPS)} when onedemo opens it"
+    if version < max(STEPS):
+        schema += f", which is brought to {max(STEPS)} when onedemo opens it"
     yield Finding("database", True, f"whole; {_count(ratings, 'rating')}; {schema}")
 
 

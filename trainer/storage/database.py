@@ -26,7 +26,8 @@ class Database:
     Safe to use from many threads. Close it when done.
 
     Raises:
-        UserError: If the directory is not writable, the file is not a database, or it is newer.
+        UserError: If the directory is not writable, the file is not a database, or it is newer than this
+            program or older than the first release.
     """
 
     def __init__(self, data_dir: Path) -> None:
@@ -47,9 +48,7 @@ class Database:
             migrate(self._db)
         except ValueError as error:
             self._db.close()
-            raise UserError(
-                f"{self.path} was written by a newer onedemo ({error}); update onedemo to open it"
-            ) from None
+            raise UserError(f"{self.path} was {error}") from None
         except sqlite3.DatabaseError as error:
             self._db.close()
             raise UserError(

@@ -1,29 +1,38 @@
-"""The database schema, one step per version. A step, once released, never changes.
+"""The database schema: the first release's, then one step per version. A step, once released, stays.
 
-``PRAGMA user_version`` holds the number of steps a database has seen.
+``PRAGMA user_version`` holds the number of the last step a database has seen; 0 is an empty one. Numbers 1
+to 4 were used before the first release; databases of those are refused.
 """
 
 from __future__ import annotations
 
 import sqlite3
 
-STEPS: tuple[str, ...] = (
-    # 1: people and their links; runs; clips with the segment behind each; append-only events.
-    """
+STEPS: dict[int, str] = {
+    5: """
+    -- People, and their links and sessions.
     CREATE TABLE raters (
         id INTEGER PRIMARY KEY,
         name TEXT NOT NULL UNIQUE,
         role TEXT NOT NULL CHECK (role IN ('annotator', 'researcher', 'simulated')),
-        created_at TEXT NOT NULL
+        created_at TEXT NOT NULL,
+        practised_at TEXT               -- when the practice clips were done
     );
-    -- A link (in a URL) or a session (in a cookie). Only the SHA-256 of the token is stored.
+    -- A link (in a URL) or a session (in a cookie).
     CREATE TABLE tokens (
-        hash TEXT PRIMARY KEY,
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        hash TEXT NOT NULL UNIQUE,      -- SHA-256 of the token, never the token
         rater_id INTEGER NOT NULL REFERENCES raters (id),
         kind TEXT NOT NULL CHECK (kind IN ('link', 'session')),
+        link_id INTEGER REFERENCES tokens (id),  -- of a session: the link it came by, if that is known
+        once INTEGER NOT NULL DEFAULT 0 CHECK (once IN (0, 1)),  -- of a link: it opens once
         created_at TEXT NOT NULL,
+        expires_at TEXT,                -- none: it does not
+        last_used_at TEXT,
         revoked_at TEXT
     );
+    CREATE INDEX tokens_by_rater ON tokens (rater_id, kind);
+    -- Runs, and what training recorded for each.
     CREATE TABLE runs (
         id TEXT PRIMARY KEY,
         demo TEXT NOT NULL,
@@ -31,44 +40,9 @@ STEPS: tuple[str, ...] = (
         seed INTEGER NOT NULL,
         config TEXT NOT NULL,           -- TOML, resolved
         version TEXT NOT NULL,
-        created_at TEXT NOT NULL
-    );
-    CREATE TABLE clips (
-        id INTEGER PRIMARY KEY AUTOINCREMENT,
-        run TEXT NOT NULL REFERENCES runs (id),
-        demo_step INTEGER NOT NULL,     -- control step of the demo at which the clip begins
-        steps INTEGER NOT NULL,         -- length in control steps
-        stage TEXT NOT NULL CHECK (stage IN ('pretrain', 'online')),
-        iteration INTEGER NOT NULL,     -- whose rollouts it was cut from
-        snapshot INTEGER NOT NULL,      -- that made the prediction; 0: none
-        predicted REAL,                 -- 1..5
-        state TEXT NOT NULL DEFAULT 'cut' CHECK (state IN ('cut', 'ready', 'withdrawn')),
-        created_at TEXT NOT NULL
-    );
-    CREATE INDEX clips_by_run ON clips (run, state, id);
-    -- Observations, actions, qpos and qvel of the clip, as NPZ. A rating is worthless without them.
-    CREATE TABLE segments (
-        clip_id INTEGER PRIMARY KEY REFERENCES clips (id),
-        data BLOB NOT NULL
-    );
-    -- What raters did, append-only. The last event of a rater on a clip is the one that holds.
-    CREATE TABLE events (
-        id INTEGER PRIMARY KEY AUTOINCREMENT,
-        clip_id INTEGER NOT NULL REFERENCES clips (id),
-        rater_id INTEGER NOT NULL REFERENCES raters (id),
-        kind TEXT NOT NULL CHECK (kind IN ('rate', 'undo', 'skip')),
-        value INTEGER CHECK (value BETWEEN 1 AND 5),
-        snapshot INTEGER NOT NULL,      -- newest prediction of the clip at that time
-        predicted REAL,
-        latency_ms INTEGER NOT NULL,    -- from the clip on screen to the press
         created_at TEXT NOT NULL,
-        CHECK ((kind = 'rate') = (value IS NOT NULL))
+        clips INTEGER NOT NULL DEFAULT 0  -- ever cut
     );
-    CREATE INDEX events_by_clip ON events (clip_id, rater_id, id);
-    CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
-        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
-    CREATE TRIGGER events_keep_delete BEFORE DELETE ON events
-        BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
     CREATE TABLE snapshots (
         run TEXT NOT NULL REFERENCES runs (id),
         number INTEGER NOT NULL,
@@ -87,87 +61,34 @@ STEPS: tuple[str, ...] = (
         created_at TEXT NOT NULL,
         PRIMARY KEY (run, number)
     );
-    -- What other programs read: the ratings that hold, one row each.
-    CREATE VIEW ratings AS
-        SELECT e.id, e.clip_id, c.run, r.demo, p.name AS rater, e.value, c.stage, c.iteration,
-               e.created_at, e.latency_ms, e.snapshot, e.predicted, c.demo_step, c.steps
-        FROM events e
-        JOIN clips c ON c.id = e.clip_id
-        JOIN runs r ON r.id = c.run
-        JOIN raters p ON p.id = e.rater_id
-        WHERE e.kind = 'rate' AND NOT EXISTS (
-            SELECT 1 FROM events l
-            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
-        );
-    """,
-    # 2: counts kept by triggers, so that what the page asks at every press does not grow with the
-    # events. The events stay the one truth: everything here can be worked out from them again.
-    # Segments are written as one NPY from here on (trainer/storage/segment_codec.py); older ones stay NPZ.
-    """
-    -- Ratings that hold.
-    CREATE TABLE tallies (
+    -- Clips, with the segment behind each.
+    CREATE TABLE clips (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
         run TEXT NOT NULL REFERENCES runs (id),
-        rater_id INTEGER NOT NULL REFERENCES raters (id),
-        stage TEXT NOT NULL,
-        value INTEGER NOT NULL,
-        ratings INTEGER NOT NULL,
-        PRIMARY KEY (run, rater_id, stage, value)
-    ) WITHOUT ROWID;
-    INSERT INTO tallies
-        SELECT c.run, e.rater_id, c.stage, e.value, COUNT(*)
-        FROM events e JOIN clips c ON c.id = e.clip_id
-        WHERE e.kind = 'rate' AND NOT EXISTS (
-            SELECT 1 FROM events l
-            WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
-        )
-        GROUP BY c.run, e.rater_id, c.stage, e.value;
-    -- Ratings and skips of a clip that hold.
-    ALTER TABLE clips ADD COLUMN answers INTEGER NOT NULL DEFAULT 0;
-    UPDATE clips SET answers = held.answers
-        FROM (
-            SELECT e.clip_id, COUNT(*) AS answers FROM events e
-            WHERE e.kind != 'undo' AND NOT EXISTS (
-                SELECT 1 FROM events l
-                WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.id > e.id
-            )
-            GROUP BY e.clip_id
-        ) AS held
-        WHERE clips.id = held.clip_id;
+        demo_step INTEGER NOT NULL,     -- control step of the demo at which the clip begins
+        steps INTEGER NOT NULL,         -- length in control steps
+        stage TEXT NOT NULL CHECK (stage IN ('pretrain', 'online')),
+        iteration INTEGER NOT NULL,     -- whose rollouts it was cut from
+        snapshot INTEGER NOT NULL,      -- that made the prediction; 0: none
+        predicted REAL,                 -- 1..5
+        state TEXT NOT NULL DEFAULT 'cut' CHECK (state IN ('cut', 'ready', 'withdrawn')),
+        created_at TEXT NOT NULL,
+        answers INTEGER NOT NULL DEFAULT 0,  -- ratings and skips of it that hold
+        choice TEXT NOT NULL DEFAULT '',  -- why it is asked; trainer/queries/selection.py
+        score REAL                      -- by what it was chosen
+    );
     CREATE INDEX clips_waiting ON clips (run, state, id) WHERE answers = 0;
-    DROP INDEX clips_by_run;
-    -- Clips ever cut.
-    ALTER TABLE runs ADD COLUMN clips INTEGER NOT NULL DEFAULT 0;
-    UPDATE runs SET clips = (SELECT COUNT(*) FROM clips WHERE clips.run = runs.id);
     CREATE TRIGGER clips_count AFTER INSERT ON clips BEGIN
         UPDATE runs SET clips = clips + 1 WHERE id = new.run;
     END;
-    -- A new event takes the place of the rater's event before it on the same clip, whatever both are.
-    CREATE TRIGGER events_count AFTER INSERT ON events BEGIN
-        UPDATE tallies SET ratings = ratings - 1
-            WHERE (run, stage) = (SELECT run, stage FROM clips WHERE id = new.clip_id)
-            AND rater_id = new.rater_id AND value = (
-                SELECT value FROM events
-                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND id < new.id
-                ORDER BY id DESC LIMIT 1
-            );
-        INSERT INTO tallies
-            SELECT run, new.rater_id, stage, new.value, 1 FROM clips
-            WHERE id = new.clip_id AND new.kind = 'rate'
-            ON CONFLICT DO UPDATE SET ratings = ratings + 1;
-        UPDATE clips SET answers = answers + (new.kind != 'undo') - COALESCE((
-                SELECT kind != 'undo' FROM events
-                WHERE clip_id = new.clip_id AND rater_id = new.rater_id AND id < new.id
-                ORDER BY id DESC LIMIT 1
-            ), 0)
-            WHERE id = new.clip_id;
-    END;
-    """,
-    # 3: what else a rater can say: where in the clip it goes wrong, why a clip is skipped, and a second
-    # opinion on the same clip; a rater may be left out of training; a clip knows why it was asked.
-    # The log of events is laid out anew for this, every event and its number as it was.
-    """
-    DROP VIEW ratings;
-    CREATE TABLE events_new (
+    -- Observations, actions, qpos and qvel of the clip (trainer/storage/segment_codec.py). A rating is
+    -- worthless without them.
+    CREATE TABLE segments (
+        clip_id INTEGER PRIMARY KEY REFERENCES clips (id),
+        data BLOB NOT NULL
+    );
+    -- What raters did, append-only. The last event of a rater on a clip is the one that holds.
+    CREATE TABLE events (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         clip_id INTEGER REFERENCES clips (id),  -- none: it is about the rater
         rater_id INTEGER NOT NULL REFERENCES raters (id),
@@ -190,17 +111,24 @@ STEPS: tuple[str, ...] = (
         CHECK (mark_start IS NULL OR (kind = 'rate' AND 0 <= mark_start AND mark_start < mark_end)),
         CHECK (reason IS NULL OR kind = 'skip')
     );
-    INSERT INTO events_new (id, clip_id, rater_id, kind, value, snapshot, predicted, latency_ms, created_at)
-        SELECT id, clip_id, rater_id, kind, value, snapshot, predicted, latency_ms, created_at FROM events;
-    DROP TABLE events;
-    ALTER TABLE events_new RENAME TO events;
     CREATE INDEX events_by_clip ON events (clip_id, rater_id, repeat, id);
     CREATE INDEX events_about_raters ON events (run, rater_id, id) WHERE clip_id IS NULL;
     CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
         BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
     CREATE TRIGGER events_keep_delete BEFORE DELETE ON events
         BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
-    -- As before; second opinions do not count.
+    -- Ratings that hold, counted by triggers, so that what the page asks at every press does not grow with
+    -- the events. The events stay the one truth: these counts can be worked out from them again.
+    CREATE TABLE tallies (
+        run TEXT NOT NULL REFERENCES runs (id),
+        rater_id INTEGER NOT NULL REFERENCES raters (id),
+        stage TEXT NOT NULL,
+        value INTEGER NOT NULL,
+        ratings INTEGER NOT NULL,
+        PRIMARY KEY (run, rater_id, stage, value)
+    ) WITHOUT ROWID;
+    -- A new event takes the place of the rater's event before it on the same clip, whatever both are.
+    -- Second opinions do not count.
     CREATE TRIGGER events_count AFTER INSERT ON events WHEN new.clip_id IS NOT NULL AND new.repeat = 0 BEGIN
         UPDATE tallies SET ratings = ratings - 1
             WHERE (run, stage) = (SELECT run, stage FROM clips WHERE id = new.clip_id)
@@ -220,10 +148,7 @@ STEPS: tuple[str, ...] = (
             ), 0)
             WHERE id = new.clip_id;
     END;
-    ALTER TABLE clips ADD COLUMN choice TEXT NOT NULL DEFAULT '';  -- why it is asked; queries/selection.py
-    ALTER TABLE clips ADD COLUMN score REAL;  -- by what it was chosen
-    ALTER TABLE raters ADD COLUMN practised_at TEXT;  -- when the practice clips were done
-    -- The ratings that hold, one row each; second opinions have repeat 1.
+    -- What other programs read: the ratings that hold, one row each; second opinions have repeat 1.
     CREATE VIEW ratings AS
         SELECT e.id, e.clip_id, c.run, r.demo, p.name AS rater, e.value, c.stage, c.iteration,
                e.created_at, e.latency_ms, e.snapshot, e.predicted, c.demo_step, c.steps,
@@ -241,9 +166,7 @@ STEPS: tuple[str, ...] = (
             SELECT 1 FROM events l
             WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
         );
-    """,
-    # 4: pairs of clips, and which of the two is nearer to the demo.
-    """
+    -- Pairs of clips, and which of the two is nearer to the demo.
     CREATE TABLE pairs (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         run TEXT NOT NULL REFERENCES runs (id),
@@ -283,30 +206,7 @@ STEPS: tuple[str, ...] = (
             SELECT 1 FROM comparisons l
             WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id AND l.id > c.id
         );
-    """,
-    # 5: links that end by themselves, sessions that know by which link they came, and a log of who came in
-    # and took what. Tokens are laid out anew for this; sessions of before end as they would have.
-    """
-    CREATE TABLE tokens_new (
-        id INTEGER PRIMARY KEY AUTOINCREMENT,
-        hash TEXT NOT NULL UNIQUE,      -- SHA-256 of the token, never the token
-        rater_id INTEGER NOT NULL REFERENCES raters (id),
-        kind TEXT NOT NULL CHECK (kind IN ('link', 'session')),
-        link_id INTEGER REFERENCES tokens_new (id),  -- of a session: the link it came by, if that is known
-        once INTEGER NOT NULL DEFAULT 0 CHECK (once IN (0, 1)),  -- of a link: it opens once
-        created_at TEXT NOT NULL,
-        expires_at TEXT,                -- none: it does not
-        last_used_at TEXT,
-        revoked_at TEXT
-    );
-    INSERT INTO tokens_new (hash, rater_id, kind, created_at, expires_at, revoked_at)
-        SELECT hash, rater_id, kind, created_at,
-               CASE kind WHEN 'session' THEN strftime('%Y-%m-%dT%H:%M:%fZ', created_at, '+30 days') END,
-               revoked_at
-        FROM tokens ORDER BY rowid;
-    DROP TABLE tokens;
-    ALTER TABLE tokens_new RENAME TO tokens;
-    CREATE INDEX tokens_by_rater ON tokens (rater_id, kind);
+    -- Who came in, and took or changed what.
     CREATE TABLE audit (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         at TEXT NOT NULL,
@@ -322,7 +222,7 @@ STEPS: tuple[str, ...] = (
     # 6: marks in control steps, worked out once from the seconds of earlier ratings (mark_start, mark_end:
     # they stay as they were written, and nothing writes or reads them any more); the view gives seconds as
     # before. What a rater said last is found by index, so that undo can ask for it.
-    """
+    6: """
     ALTER TABLE runs ADD COLUMN step_seconds REAL NOT NULL DEFAULT 0.008;  -- of a control step
     ALTER TABLE events ADD COLUMN mark_from INTEGER CHECK (mark_from >= 0);  -- first marked step of the clip
     ALTER TABLE events ADD COLUMN mark_to INTEGER  -- the step after the last marked one
@@ -357,32 +257,43 @@ STEPS: tuple[str, ...] = (
             WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
         );
     """,
-)
+}
 
 
 def check_version(connection: sqlite3.Connection) -> int:
     """The schema version of a database; reads only.
 
     Raises:
-        ValueError: If the database was made by a newer program.
+        ValueError: If the database was made by a newer program or before the first release. It says so and
+            what to do, to be put behind "the database was".
     """
     (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if version > len(STEPS):
-        raise ValueError(f"schema version {version}, this program knows versions up to {len(STEPS)}")
+    if version > max(STEPS):
+        raise ValueError(
+            f"written by a newer onedemo (schema version {version}, this one reads up to {max(STEPS)}); "
+            "update onedemo to open it"
+        )
+    if 0 < version < min(STEPS):
+        raise ValueError(
+            f"written before onedemo 0.1.0 (schema version {version}, the first release has {min(STEPS)}); "
+            "open it with the onedemo that wrote it, or choose another --data-dir"
+        )
     return version
 
 
 def migrate(connection: sqlite3.Connection) -> None:
-    """Brings a database to the newest version, all steps or none of each.
+    """Brings a database to the newest version, all or nothing of each step.
 
     Args:
         connection: In autocommit mode.
 
     Raises:
-        ValueError: If the database was made by a newer program.
+        ValueError: As ``check_version``.
     """
     version = check_version(connection)
-    for number, step in enumerate(STEPS[version:], start=version + 1):
+    for number, step in sorted(STEPS.items()):
+        if number <= version:
+            continue
         try:
             connection.executescript(f"BEGIN IMMEDIATE; {step} PRAGMA user_version = {number}; COMMIT;")
         except sqlite3.Error:

@@ -29,7 +29,7 @@ def pack_segment(segment: Segment) -> bytes:
 
 
 def unpack_segment(data: bytes) -> Segment:
-    """The reverse of ``pack_segment``; also reads the NPZ files of older databases.
+    """The reverse of ``pack_segment``; also reads NPZ, as in databases that began with schema 1.
 
     Returns:
         A segment whose arrays cannot be written to.

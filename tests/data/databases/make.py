@@ -1,4 +1,4 @@
-"""Makes the stored databases of each schema version: ``python tests/databases/make.py``.
+"""Makes the stored databases of each schema version: ``python tests/data/databases/make.py``.
 
 Those that are there are left as they are: a database of an old version is made once, when that version
 is the newest, and then only read.
@@ -6,7 +6,6 @@ is the newest, and then only read.
 
 from __future__ import annotations
 
-import io
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -27,22 +26,13 @@ def segment(number: int) -> Segment:
     return Segment(**{name: np.full((4, size), number + size / 100) for name, size in SIZES.items()})
 
 
-def packed(number: int, version: int) -> bytes:
-    """A segment as that version wrote it."""
-    if version > 1:
-        return pack_segment(segment(number))
-    buffer = io.BytesIO()
-    arrays = {name: getattr(segment(number), name) for name in SIZES}
-    np.savez(buffer, allow_pickle=False, **arrays)
-    return buffer.getvalue()
-
-
 def make(version: int, file: Path) -> None:
     """A database of that version, with rows in every table it has."""
     with closing(sqlite3.connect(file, isolation_level=None)) as db:
         db.execute("PRAGMA page_size = 1024")
-        for step in STEPS[:version]:
-            db.executescript(step)
+        for number, step in sorted(STEPS.items()):
+            if number <= version:
+                db.executescript(step)
         db.execute(f"PRAGMA user_version = {version}")
         put = db.execute
         for name, role in (("ada", "researcher"), ("bo", "annotator"), ("oracle", "simulated")):
@@ -56,7 +46,7 @@ def make(version: int, file: Path) -> None:
             put("INSERT INTO clips (run, demo_step, steps, stage, iteration, snapshot, predicted, state,"
                 " created_at) VALUES ('hop-1', ?, 4, ?, 0, 1, 2.5, 'ready', ?)",
                 (10 * number, "pretrain" if number < 4 else "online", AT))  # fmt: skip
-            put("INSERT INTO segments VALUES (?, ?)", (number, packed(number, version)))
+            put("INSERT INTO segments VALUES (?, ?)", (number, pack_segment(segment(number))))
         presses = ((1, 2, "rate", 5), (2, 2, "rate", 1), (2, 2, "undo", None), (2, 2, "rate", 2),
                    (3, 2, "skip", None), (1, 1, "rate", 4), (4, 3, "rate", 3))  # fmt: skip
         for clip, rater, kind, value in presses:
@@ -65,30 +55,27 @@ def make(version: int, file: Path) -> None:
                 (clip, rater, kind, value, AT))  # fmt: skip
         put("INSERT INTO snapshots VALUES ('hop-1', 1, 4, 2, '{\"loss\": 0.5}', ?)", (AT,))
         put("INSERT INTO iterations VALUES ('hop-1', 1, 1, 16000, '{\"predicted\": 2.0}', ?)", (AT,))
-        if version >= 3:
-            start, end, *mark = (
-                ("mark_from", "mark_to", 1, 3) if version >= 6 else ("mark_start", "mark_end", 0.1, 0.2)
-            )
-            put(f"INSERT INTO events (clip_id, rater_id, kind, value, repeat, {start}, {end},"
-                " snapshot, latency_ms, created_at)"
-                " VALUES (1, 2, 'rate', 4, 1, ?, ?, 1, 800, ?)", (*mark, AT))  # fmt: skip
-            put("INSERT INTO events (clip_id, rater_id, kind, reason, snapshot, latency_ms, created_at)"
-                " VALUES (5, 2, 'skip', 'too dark', 1, 700, ?)", (AT,))  # fmt: skip
-            put("INSERT INTO events (rater_id, kind, snapshot, latency_ms, run, by_id, created_at)"
-                " VALUES (3, 'leave out', 1, 0, 'hop-1', 1, ?)", (AT,))  # fmt: skip
-        if version >= 4:
-            put("INSERT INTO pairs (run, demo_step, steps, stage, iteration, left_segment, right_segment,"
-                " state, created_at) VALUES ('hop-1', 20, 4, 'online', 1, ?, ?, 'ready', ?)",
-                (packed(7, version), packed(8, version), AT))  # fmt: skip
-            put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
-                " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
-        if version >= 5:
-            put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
-            put("INSERT INTO audit (at, who, what, detail) VALUES (?, 'ada', 'came in', 'link 1')", (AT,))
+        start, end, *mark = (
+            ("mark_from", "mark_to", 1, 3) if version >= 6 else ("mark_start", "mark_end", 0.1, 0.2)
+        )
+        put(f"INSERT INTO events (clip_id, rater_id, kind, value, repeat, {start}, {end},"
+            " snapshot, latency_ms, created_at)"
+            " VALUES (1, 2, 'rate', 4, 1, ?, ?, 1, 800, ?)", (*mark, AT))  # fmt: skip
+        put("INSERT INTO events (clip_id, rater_id, kind, reason, snapshot, latency_ms, created_at)"
+            " VALUES (5, 2, 'skip', 'too dark', 1, 700, ?)", (AT,))  # fmt: skip
+        put("INSERT INTO events (rater_id, kind, snapshot, latency_ms, run, by_id, created_at)"
+            " VALUES (3, 'leave out', 1, 0, 'hop-1', 1, ?)", (AT,))  # fmt: skip
+        put("INSERT INTO pairs (run, demo_step, steps, stage, iteration, left_segment, right_segment,"
+            " state, created_at) VALUES ('hop-1', 20, 4, 'online', 1, ?, ?, 'ready', ?)",
+            (pack_segment(segment(7)), pack_segment(segment(8)), AT))  # fmt: skip
+        put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
+            " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
+        put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
+        put("INSERT INTO audit (at, who, what, detail) VALUES (?, 'ada', 'came in', 'link 1')", (AT,))
         put("VACUUM")
 
 
 if __name__ == "__main__":
-    for number in range(1, len(STEPS) + 1):
+    for number in STEPS:
         if not (HERE / f"v{number}.sqlite3").exists():
             make(number, HERE / f"v{number}.sqlite3")

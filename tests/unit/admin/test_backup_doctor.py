@@ -235,7 +235,8 @@ def other_database(statement):
         (named("demos/../../outside"), "is not the name of a plain file"),
         (named("link", b"/etc/passwd", stat.S_IFLNK), "'link' is not the name of a plain file"),
         (named("pipe", b"", stat.S_IFIFO), "'pipe' is not the name of a plain file"),
-        (other_database("PRAGMA user_version = 999"), "saved by a newer onedemo .*version 999"),
+        (other_database("PRAGMA user_version = 999"), "written by a newer onedemo .*version 999"),
+        (other_database("PRAGMA user_version = 4"), "the database in .* was written before onedemo 0.1.0"),
         (other_database("DROP VIEW ratings"), "the database in .* is damaged"),
     ],
 )  # fmt: skip

@@ -67,7 +67,7 @@ def test_bad_input_is_one_sentence_and_code_2(arguments, sentence, tmp_path, cap
 def test_a_newer_database_stays_as_it_is(tmp_path, capsys):
     Store(tmp_path).close()
     with sqlite3.connect(tmp_path / FILE_NAME) as db:
-        db.execute(f"PRAGMA user_version = {len(SCHEMA) + 1}")
+        db.execute(f"PRAGMA user_version = {max(SCHEMA) + 1}")
     db.close()
     assert main(["export", "--data-dir", str(tmp_path)]) == 2
     assert "newer onedemo" in capsys.readouterr().err

@@ -1,17 +1,12 @@
-"""What the triggers keep is what the events say: after any presses, and after a migration."""
+"""What the triggers keep is what the events say, after any presses."""
 
-import io
 import sqlite3
-import threading
 from contextlib import closing
 
 import numpy as np
 import pytest
 
-from onedemo.storage import schema
 from onedemo.storage.clips import NewClip
-from onedemo.storage.database import FILE_NAME
-from onedemo.storage.schema import STEPS, migrate
 from onedemo.storage.store import Store
 from onedemo.types import Segment
 
@@ -125,91 +120,3 @@ def test_a_press_that_fails_counts_for_nothing(store):
         raise RuntimeError
     assert sum(store.ratings.by_class()) == 0
     assert_kept_as_the_events_say(store)
-
-
-# Databases of the first version
-
-_NPZ = io.BytesIO()
-np.savez(_NPZ, obs=np.full((38, 11), 0.1), actions=np.ones((38, 3), "f4"), qpos=np.zeros((38, 6)),
-         qvel=np.zeros((38, 6)))  # fmt: skip
-
-
-def first_version(directory):
-    """A database made by step 1 alone: two runs, three raters, ratings, skips, undos and second thoughts."""
-    directory.mkdir(exist_ok=True)
-    rng = np.random.default_rng(5)
-    with closing(sqlite3.connect(directory / FILE_NAME)) as db:
-        db.executescript(f"BEGIN; {STEPS[0]} PRAGMA user_version = 1; COMMIT;")
-        for run in RUNS:
-            db.execute("INSERT INTO runs VALUES (?, 'd', '0', 0, '', '0.1.0', '')", (run,))
-        for name in ("Ann", "Bob", "Cy"):
-            db.execute("INSERT INTO raters (name, role, created_at) VALUES (?, 'annotator', '')", (name,))
-        for clip in range(1, 41):
-            place = RUNS[clip % 2], ("pretrain", "online")[clip % 3 == 0], STATES[clip % 5 % 3]
-            db.execute(
-                "INSERT INTO clips (run, demo_step, steps, stage, iteration, snapshot, state, created_at)"
-                " VALUES (?, 7, 38, ?, 0, 0, ?, '')",
-                place,
-            )
-            db.execute("INSERT INTO segments VALUES (?, ?)", (clip, _NPZ.getvalue()))
-        held = set()
-        for _ in range(400):
-            clip, rater = int(rng.integers(1, 31)), int(rng.integers(1, 4))  # ten clips nobody looked at
-            kind = "undo" if (clip, rater) in held else ("rate", "rate", "skip")[int(rng.integers(3))]
-            (held.discard if kind == "undo" else held.add)((clip, rater))
-            value = int(rng.integers(1, 6)) if kind == "rate" else None
-            db.execute(
-                "INSERT INTO events (clip_id, rater_id, kind, value, snapshot, latency_ms, created_at)"
-                " VALUES (?, ?, ?, ?, 0, 0, '')",
-                (clip, rater, kind, value),
-            )
-        db.commit()
-        return db.execute("SELECT * FROM ratings ORDER BY id").fetchall()
-
-
-def test_a_database_of_the_first_version_is_migrated_with_all_it_holds(tmp_path):
-    ratings = first_version(tmp_path)
-    assert len(ratings) > 20
-    with closing(Store(tmp_path)) as store:
-        assert store.database.rows("PRAGMA user_version") == [(len(STEPS),)]
-        assert [row[: len(ratings[0])] for row in store.ratings.stream()] == [tuple(row) for row in ratings]
-        assert_kept_as_the_events_say(store)
-        assert store.clips.segment(3).obs[0, 0] == 0.1 and store.clips.segment(3).actions.dtype == np.float32
-        for clip in store.clips.waiting(RUNS[0]):
-            store.ratings.rate(clip.id, 1, 5, latency_ms=1)
-        store.ratings.undo(
-            ratings[0][1], next(r.id for r in store.accounts.raters() if r.name == ratings[0][4])
-        )
-        assert_kept_as_the_events_say(store)
-        assert store.database.rows("PRAGMA foreign_key_check") == []
-
-
-def test_two_processes_may_open_an_old_database_at_once(tmp_path):
-    first_version(tmp_path)
-    stores, failures = [], []
-
-    def open_it():
-        try:
-            stores.append(Store(tmp_path))
-        except BaseException as error:
-            failures.append(error)
-
-    threads = [threading.Thread(target=open_it) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failures and len(stores) == 4
-    for store in stores:
-        assert_kept_as_the_events_say(store)
-        store.close()
-
-
-def test_a_step_that_fails_leaves_the_database_as_it_was(tmp_path, monkeypatch):
-    first_version(tmp_path)
-    monkeypatch.setattr(schema, "STEPS", (STEPS[0], "CREATE TABLE half (a); CREATE TABLE raters (a);"))
-    with closing(sqlite3.connect(tmp_path / FILE_NAME, isolation_level=None)) as db:
-        with pytest.raises(sqlite3.OperationalError, match="raters"):
-            migrate(db)
-        assert db.execute("PRAGMA user_version").fetchone() == (1,)
-        assert not db.execute("SELECT 1 FROM sqlite_master WHERE name = 'half'").fetchall()
