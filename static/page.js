@@ -162,7 +162,7 @@
       if (arrows && event.target.closest?.("[role=slider], [role=tablist]")) return;
       const key = event.key === "Backspace" ? "u" : event.key.toLowerCase();
       if (/^[1-5su]$/.test(key) && !event.altKey) {
-        stop();
+        event.preventDefault();
         if (!event.repeat) key === "u" ? undo() : answer(key);
         return;
       }

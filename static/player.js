@@ -1,4 +1,4 @@
-// Plays clips. One picture holds all frames of both sides (trainer/clips.py); they are drawn onto
+// Plays clips. One picture holds all frames of both sides (trainer/render/clip_image.py); they are drawn onto
 // canvases here, so that a clip can be slowed down, stepped through and marked. Whatever element has
 // data-src is a player; elements come and go as the server redraws the page.
 const clips = (() => {
