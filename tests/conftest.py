@@ -92,11 +92,8 @@ class Site:
 
 
 @pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+def site(tmp_path: Path) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
-    monkeypatch.setattr(
-        "onedemo.app.services.live_rollout.FRAMES_PER_SECOND", 5.0
-    )  # without a GPU each costs a tenth of a second
     from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
     from onedemo.app.http.bind import Listening
@@ -110,6 +107,8 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
         trainer,
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
         again=Again(shared=0, repeated=0),
+        guard_seconds=0.05,
+        live_fps=5.0,  # without a GPU each frame costs a tenth of a second
     )
     front = Front(page, Listening(port=0))
     url = front.start()

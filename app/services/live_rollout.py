@@ -21,7 +21,6 @@ from onedemo.sim import vector_env
 
 log = logging.getLogger("onedemo.page")
 
-FRAMES_PER_SECOND = 30.0
 _BEHIND_SECONDS = 0.25
 """If it falls behind by more than this it drops the rest rather than run after it."""
 
@@ -54,17 +53,20 @@ class Live:
         acting: Gives what acts in the next episode, or None while there is nothing.
         seconds: Length of an episode: the demo's.
         environment: Name in the registry of environments.
+        frames_per_second: How often watchers are called.
     """
 
     def __init__(
-        self, acting: Callable[[], Acting | None], seconds: float, environment: str = "hopper"
-    ) -> None:
+        self, acting: Callable[[], Acting | None], seconds: float, environment: str = "hopper",
+        *, frames_per_second: float = 30.0,
+    ) -> None:  # fmt: skip
         self._acting = acting
         spec = vector_env.spec(environment)
         self.model_path = spec.xml
         self._dt = spec.dt
         self._horizon = max(1, round(seconds / spec.dt))
         self._environment = environment
+        self._pause = 1 / frames_per_second
         self._watchers: dict[object, Watcher] = {}
         self._wake = threading.Condition()
         self._closing = False
@@ -72,7 +74,7 @@ class Live:
         self._thread.start()
 
     def watch(self, key: object, watcher: Watcher) -> None:
-        """Calls ``watcher`` about 30 times a second, from the live thread, until ``leave``."""
+        """Calls ``watcher`` ``frames_per_second`` times a second, from the live thread, until ``leave``."""
         with self._wake:
             self._watchers[key] = watcher
             self._wake.notify()
@@ -127,7 +129,7 @@ class Live:
                     watcher(moment)
                 except Exception:
                     log.exception("a watcher could not be served")
-            time.sleep(max(0.005, 1 / FRAMES_PER_SECOND - max(0.0, time.monotonic() - due)))
+            time.sleep(max(0.005, self._pause - max(0.0, time.monotonic() - due)))
 
     def _moment(
         self, qpos: np.ndarray, model: mujoco.MjModel, data: mujoco.MjData, clock: int, elapsed: int,

@@ -48,13 +48,16 @@ class Page:
         study: All runs; None if there is this one alone.
         compare: Whether annotators are asked pairs, too.
         guard_seconds: A press that comes sooner after a clip was not made for it.
+        live_fps: How often the live robot is drawn, in frames a second.
     """
 
     def __init__(
         self, trainer: Any, *, pictures: Pictures | None = None, again: Again | None = None,
         study: Study | None = None, compare: bool = False, guard_seconds: float = GUARD_SECONDS,
+        live_fps: float = 30.0,
     ) -> None:  # fmt: skip
         self.study, self._compare, self._guard_seconds = study, compare, guard_seconds
+        self._live_fps = live_fps
         self.secret = secrets.token_urlsafe(32)
         self._again = again or Again()
         self._attach(trainer, pictures)
@@ -85,7 +88,7 @@ class Page:
         self.pictures = pictures or Pictures(trainer.demo)
         self._assignment = Assignment(again=self._again)
         self._pair_assignment = Assignment()
-        self._live = Live(trainer.acting, trainer.demo.seconds)
+        self._live = Live(trainer.acting, trainer.demo.seconds, frames_per_second=self._live_fps)
 
     def close(self) -> None:
         """Ends all sessions and the server behind them."""

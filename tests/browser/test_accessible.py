@@ -28,8 +28,9 @@ def assert_nothing_serious(page, where: str) -> None:
     assert not found, (where, found)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
+@pytest.mark.parametrize(
+    ("viewport", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop-light", "phone-dark"]
+)
 def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
     from onedemo.app.http.tokens import issue_link, read_secret
 

@@ -58,7 +58,7 @@ def health(link):
 
 def rate(page, data_dir, value, how="key"):
     """Rates the clip on screen and returns (clip, value) once the database holds it."""
-    clip, before = shown_clip(page), len(rows(data_dir))
+    clip, before = shown_clip(page, guard_ms=350), len(rows(data_dir))
     if how == "key":
         page.keyboard.press(str(value))
     elif how == "button":

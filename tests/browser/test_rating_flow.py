@@ -22,14 +22,13 @@ def marks_of(site) -> list[tuple]:
     )
 
 
-@BOTH
-def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromium, site, viewport):
+def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromium, site):
     from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
     new = store.accounts.ensure("new", "annotator")
     link = issue_link(store, read_secret(store.path.parent), new, site.url)
-    with opened(chromium, link, viewport) as page:
+    with opened(chromium, link) as page:
         page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
         page.keyboard.press("ArrowRight")  # both sides stand still
@@ -56,9 +55,8 @@ def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromiu
         assert len(site.events()) == 1
 
 
-@BOTH
-def test_slow_motion_steps_and_replay(chromium, site, viewport):
-    with opened(chromium, site.links["annotator"], viewport) as page:
+def test_slow_motion_steps_and_replay(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
         shown_clip(page)
         page.keyboard.press("ArrowRight")
         here, before = frame_of(page), drawn(page, "right")
@@ -242,14 +240,13 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
         assert marks_of(site)[1][2:] == (None, None)
 
 
-@BOTH
-def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site, viewport):
+def test_a_skip_may_be_explained_and_typing_never_rates(chromium, site):
     def reasons():
         return site.trainer.store.database.rows(
             "SELECT reason FROM events WHERE reason IS NOT NULL ORDER BY id"
         )
 
-    with opened(chromium, site.links["annotator"], viewport) as page:
+    with opened(chromium, site.links["annotator"]) as page:
         shown_clip(page)
         place = page.locator(".od-clip").bounding_box()
         press_and_wait(page, site, lambda: page.keyboard.press("s"))

@@ -36,12 +36,11 @@ def to_tab(page, name):
     page.click(f'.od-tabs >> text="{name}"')
 
 
-@BOTH
-def test_whether_ratings_are_good_and_who_is_left_out(chromium, site, viewport):
+def test_whether_ratings_are_good_and_who_is_left_out(chromium, site):
     rate_some(site)
     store, run = site.trainer.store, site.trainer.run
     bob = {rater.name: rater.id for rater in store.accounts.raters()}["Bob <i>"]
-    with opened(chromium, site.links["researcher"], viewport) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-quality >> text=30 clips", timeout=20_000)
         page.wait_for_selector(".od-quality >> text=100 %")  # the second looks
@@ -93,10 +92,9 @@ def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_pa
     ]  # fmt: skip
 
 
-@BOTH
-def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, viewport, tmp_path):
+def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, tmp_path):
     ids = rate_some(site)
-    with opened(chromium, site.links["researcher"], viewport, accept_downloads=True) as page:
+    with opened(chromium, site.links["researcher"], accept_downloads=True) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-filter")
         page.fill('.od-filter [name="rater"]', "Ann")
@@ -117,7 +115,7 @@ def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, viewport,
         assert "Krippendorff" not in (card := download("Data card").read_text()) and "| `value` |" in card
         for path in ("/preview?rater[]=x", "/export.csv?value=a", "/export.csv?id=1"):
             assert page.request.get(site.url + path).status == 400
-    with opened(chromium, site.links["annotator"], viewport) as page:
+    with opened(chromium, site.links["annotator"]) as page:
         for path in (
             "/preview",
             "/segments.parquet",
@@ -132,15 +130,14 @@ def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, viewport,
         assert page.request.post(f"{site.url}/r/2/do", data=body, headers=origin).status == 403
 
 
-@BOTH
-def test_parts_of_the_demo_and_the_best_rollouts(chromium, site, viewport):
+def test_parts_of_the_demo_and_the_best_rollouts(chromium, site):
     for k in range(1, 4):
         timeline = [None if i > 35 else round(2 + math.sin(i / 6), 2) for i in range(40)]
         site.trainer.store.runs.add_iteration(
             site.trainer.run, k, snapshot=k, env_steps=16000 * k,
             stats={"predicted": 2.0, "kl": 0.01, "best": 2.5 + k / 10, "timeline": timeline},
         )  # fmt: skip
-    with opened(chromium, site.links["researcher"], viewport, accept_downloads=True) as page:
+    with opened(chromium, site.links["researcher"], accept_downloads=True) as page:
         page.wait_for_selector(".od-parts >> text=iteration 3; between 1.0 and 3.0; weakest at 5.7 s")
         assert (
             page.locator(".od-cells i").count() == 40 and page.locator(".od-cells [data-none]").count() == 4
@@ -156,8 +153,7 @@ def test_parts_of_the_demo_and_the_best_rollouts(chromium, site, viewport):
         assert given.value.suggested_filename == "onedemo-iteration-3.webm"
 
 
-@BOTH
-def test_runs_side_by_side(chromium, site, viewport):
+def test_runs_side_by_side(chromium, site):
     store = site.trainer.store
     store.runs.add(
         run="hop-1", demo="hopper-hop", demo_sha256="0", seed=4, config='method = "paper"\n', version="0"
@@ -166,7 +162,7 @@ def test_runs_side_by_side(chromium, site, viewport):
         for k in range(1, 6):
             stats = {"predicted": 2 + above + k / 10, "kl": 0.01, "true_reward": 100.0 * k}
             store.runs.add_iteration(run, k, snapshot=k, env_steps=16000 * k, stats=stats)
-    with opened(chromium, site.links["researcher"], viewport) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-runs >> text=hop-1")
         row = page.locator(".od-runs tr", has_text="hop-1")
@@ -182,8 +178,7 @@ def test_runs_side_by_side(chromium, site, viewport):
         page.wait_for_selector(".od-form-note >> text=there is this run alone")
 
 
-@BOTH
-def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site, viewport):
+def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
     store = site.trainer.store
     for seed in range(50):
         name = f"hop-{seed}"
@@ -191,7 +186,7 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site, viewpor
             run=name, demo="hopper-hop", demo_sha256="0", seed=seed, config='method = "paper"\n', version="0"
         )
         store.runs.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
-    with opened(chromium, site.links["researcher"], viewport) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-which >> text=6 runs drawn.")
 
@@ -214,10 +209,9 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site, viewpor
         assert table["height"] < 600
 
 
-@BOTH
-def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site, viewport):
+def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site):
     site.trainer.add_pairs(4)
-    with opened(chromium, site.links["researcher"], viewport) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Compare")
 
         def shown():
@@ -248,7 +242,7 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site, viewport):
         assert answers() == expected[:-1]
         assert "pairs" in site.trainer.calls and site.events() == []
         bottom = page.locator(".od-tools").bounding_box()
-        assert bottom["y"] + bottom["height"] <= viewport["height"]
+        assert bottom["y"] + bottom["height"] <= DESKTOP["height"]
         page.keyboard.press("?")
         help = page.locator(".od-help:visible")
         assert "the left one is nearer" in help.inner_text() and "mark" not in help.inner_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,12 @@ from onedemo.types import Demo, Segment, Status
 
 FPS = 30.0
 SIZE = (360, 480)
+DEMO_FRAMES = 240
 
 
+@functools.cache
 def drawn_frames(count: int, phase: float = 0.0) -> np.ndarray:
-    """A stick that turns: cheap pictures that differ from frame to frame."""
+    """A stick that turns: pictures that differ from frame to frame, drawn once for all tests."""
     import cv2
 
     frames = np.full((count, *SIZE, 3), (236, 239, 243), np.uint8)
@@ -32,6 +35,15 @@ def drawn_frames(count: int, phase: float = 0.0) -> np.ndarray:
         )
         cv2.circle(frame, tuple(int(v) for v in centre), 18, (232, 150, 60), -1, cv2.LINE_AA)
     return frames
+
+
+@functools.cache
+def clip_picture(start: int, *phases: float) -> bytes:
+    """Ten frames of the demo from ``start`` on, beside as many robots as there are phases."""
+    from onedemo.render.clip_image import compose_clip
+
+    demo = drawn_frames(DEMO_FRAMES)[start : start + 10]
+    return compose_clip(demo, *(drawn_frames(10, phase) for phase in phases))
 
 
 class Wobble:
@@ -56,13 +68,13 @@ class StandIn:
         self.directory = data_dir / "runs" / self.run / "clips"
         self.directory.mkdir(parents=True)
         self.demo = Demo(
-            name="hopper-backflip", sha256="0" * 64, path=data_dir / "demo.mp4", fps=FPS, frames=240,
+            name="hopper-backflip", sha256="0" * 64, path=data_dir / "demo.mp4", fps=FPS, frames=DEMO_FRAMES,
             width=480, height=360, task="backflip",
         )  # fmt: skip
         self.store.runs.add(
             run=self.run, demo=self.demo.name, demo_sha256="0" * 64, seed=0, config="", version="0"
         )
-        self.frames = drawn_frames(self.demo.frames)
+        self.frames = drawn_frames(DEMO_FRAMES)
         self._lock = threading.Lock()
         self._status = Status(
             phase="pretrain",
@@ -75,17 +87,13 @@ class StandIn:
         self.add_clips(clips)
 
     def add_clips(self, count: int) -> list[int]:
-        from onedemo.render.clip_image import compose_clip
-
         new = [
             NewClip(demo_step=25 * i % 900, segment=_zeros(), stage="pretrain", iteration=0)
             for i in range(count)
         ]
         ids = [clip.id for clip in self.store.clips.add(self.run, new)]
         for number in ids:
-            start = number * 9 % 200
-            picture = compose_clip(self.frames[start : start + 10], drawn_frames(10, phase=number))
-            self.clip_file(number).write_bytes(picture)
+            self.clip_file(number).write_bytes(clip_picture(number * 9 % 200, number))
         self.store.clips.set_state(ids, "ready")
         return ids
 
@@ -109,14 +117,12 @@ class StandIn:
         return self.directory / f"pair-{pair_id}.jpg"
 
     def add_pairs(self, count: int) -> list[int]:
-        from onedemo.render.clip_image import compose_clip
         from onedemo.storage.comparisons import NewPair
 
         pair = NewPair(demo_step=100, left=_zeros(), right=_zeros(), stage="pretrain", iteration=0)
         ids = [pair.id for pair in self.store.comparisons.add_pairs(self.run, [pair] * count)]
         for number in ids:
-            robots = [drawn_frames(10, phase=number + k) for k in range(2)]
-            self.pair_file(number).write_bytes(compose_clip(self.frames[:10], *robots))
+            self.pair_file(number).write_bytes(clip_picture(0, number, number + 1))
         self.store.comparisons.set_pair_state(ids, "ready")
         return ids
 
