@@ -9,14 +9,12 @@ import math
 import pyarrow.parquet as pq
 import pytest
 
-from browser.test_page import DESKTOP, GUARD_MS, PHONE, opened, until
+from browser.test_page import DESKTOP, GUARD_MS, opened, until
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import SKIPS
 from onedemo.storage.ratings import SKIP_COLUMNS
 
 pytestmark = pytest.mark.seam
-
-BOTH = pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
 
 
 def rate_some(site):
