@@ -80,8 +80,3 @@ class PracticeConfig:
             raise ValueError(f"practice.give_up must be in 0..1, got {self.give_up}")
         if self.slack_seconds < 0:
             raise ValueError(f"practice.slack_seconds must be at least 0, got {self.slack_seconds}")
-
-    @property
-    def plain(self) -> bool:
-        """Whether nothing of it follows the predictor step by step: the paper's practice."""
-        return not (self.elastic or self.bank_share or self.give_up)
