@@ -45,7 +45,7 @@ def serve(
         data_dir: Everything is kept there.
         demo: What is to be learned.
         config: Settings of a new run.
-        explicit: Whether a run that is gone on with must have these settings, too.
+        explicit: Whether a run that is resumed must have these settings, too.
         encoder_weights: Weights of the encoder, if not its own.
         listening: Where people reach the page.
         run: Name of the run to go on with or to make; None: the newest of this demo.

@@ -189,7 +189,7 @@ class Door:
             )
         if opened is None:
             return await self._refuse(request, token, link)
-        await asyncio.to_thread(self._store.audit.add, opened.rater.name, "came in", f"link {opened.id}")
+        await asyncio.to_thread(self._store.audit.add, opened.rater.name, "signed in", f"link {opened.id}")
         response = web.HTTPSeeOther(f"/r/{opened.rater.id}")
         # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
         response.set_cookie(
@@ -207,7 +207,7 @@ class Door:
         address = self._listening.client(request)
         self._wrong[address].take()
         why = "unknown" if link is None else link.state
-        await asyncio.to_thread(self._store.audit.add, address, "was refused", f"{why} link")
+        await asyncio.to_thread(self._store.audit.add, address, "sign-in refused", f"{why} link")
         if link is None:
             return self._login_page(403, _REFUSED["unknown"])
         if link.state in ("used", "expired"):  # clicked again in the browser that it let in
@@ -228,7 +228,7 @@ _REFUSED = {
     "unknown": "This link does not work. It may be incomplete.",
     "used": "This link was used already, and opens only once. Please ask for another.",
     "expired": "The time of this link is over. Please ask for another.",
-    "revoked": "This link was withdrawn. Please ask for another if you still take part.",
+    "revoked": "This link was revoked. Please ask for another if you still take part.",
 }
 
 

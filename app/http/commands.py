@@ -32,7 +32,7 @@ class Actions:
         if not isinstance(body, dict) or not isinstance(body.get("do"), str):
             raise ValueError("an action has a name")
         actions = {
-            "leave out": self._leave_out, "take in": self._take_in, "open run": self._open,
+            "exclude": self._exclude, "include": self._include, "open run": self._open,
             "new run": self._create, "pause run": self._pause, "resume run": self._resume,
         }  # fmt: skip
         if body["do"] not in actions:
@@ -42,10 +42,10 @@ class Actions:
         detail = ", ".join(f"{key} {value}" for key, value in fields.items() if value != "")
         self._store.audit.add(who.name, body["do"], f"{detail}; run {self._page.trainer.run}")
 
-    def _leave_out(self, who: Rater, fields: dict[str, Any]) -> None:
+    def _exclude(self, who: Rater, fields: dict[str, Any]) -> None:
         self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)
 
-    def _take_in(self, who: Rater, fields: dict[str, Any]) -> None:
+    def _include(self, who: Rater, fields: dict[str, Any]) -> None:
         self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
 
     def _open(self, who: Rater, fields: dict[str, Any]) -> None:

@@ -124,7 +124,7 @@ class Proxy:
                 continue
             for browser, session in tuple(self._sockets.items()):
                 if session in ended:
-                    await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this link was withdrawn")
+                    await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this link was revoked")
 
 
 async def _pump(inside: ClientWebSocketResponse, outside: web.WebSocketResponse) -> None:

@@ -1,7 +1,7 @@
 """The robot acting with the newest policy, in real time, for everybody who watches.
 
-The demo beside it is where the run's rules put it: with an elastic clock it waits for the robot and
-hurries after it, as in practice. One thread simulates one robot and hands each state to all watchers;
+The demo beside it is where the run's rules put it: where the demo phase adapts to the robot, so it does
+here, as in practice. One thread simulates one robot and hands each state to all watchers;
 while nobody watches it sleeps. It keeps no state that training could see.
 """
 

@@ -81,7 +81,7 @@ class Study:
         """Stops the run at hand after its iteration, and goes on with another.
 
         Raises:
-            UserError: If there is no such run, or it cannot be gone on with; then all stays as it is.
+            UserError: If there is no such run, or it cannot be resumed; then all stays as it is.
         """
         with self._change:
             if run == self.trainer.run:

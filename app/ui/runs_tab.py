@@ -147,7 +147,7 @@ def runs_html(
 
 
 def method_of(config: str) -> str:
-    """The method in a run's settings; runs of before there were two are the paper's."""
+    """The method in a run's settings; legacy runs that name none are the paper's."""
     for line in config.splitlines():
         if line.startswith("method = "):
             return line.partition('"')[2].rstrip('"')

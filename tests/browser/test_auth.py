@@ -123,7 +123,7 @@ def test_a_proxy_is_believed_only_where_there_is_one(site):
     finally:
         front.close()
     ask(site.url, "/login?token=wrong", headers=asked)
-    who = [line[1] for line in site.trainer.store.audit.lines() if line[2] == "was refused"]
+    who = [line[1] for line in site.trainer.store.audit.lines() if line[2] == "sign-in refused"]
     assert who == ["10.0.0.9", "127.0.0.1"]
 
 
@@ -250,7 +250,7 @@ def test_wrong_links_are_tried_only_so_often(site):
     said = run(go())
     assert said[:WRONG_LINKS_AT_ONCE] == [403] * WRONG_LINKS_AT_ONCE
     assert set(said[WRONG_LINKS_AT_ONCE:]) == {429}
-    refused = [line for line in site.trainer.store.audit.lines() if line[2] == "was refused"]
+    refused = [line for line in site.trainer.store.audit.lines() if line[2] == "sign-in refused"]
     assert len(refused) == WRONG_LINKS_AT_ONCE  # a flood does not fill the log
 
 
@@ -463,8 +463,8 @@ def test_what_researchers_do_is_in_the_log(site):
             )
             for path in exports:
                 await (await session.get(f"{site.url}/{path}")).read()
-            await session.post(f"{site.url}/r/1/do", json={"do": "leave out", "rater": 2})
-            await session.post(f"{site.url}/r/1/do", json={"do": "leave out", "rater": 99})
+            await session.post(f"{site.url}/r/1/do", json={"do": "exclude", "rater": 2})
+            await session.post(f"{site.url}/r/1/do", json={"do": "exclude", "rater": 99})
         async with browser_session() as session:
             tab = await open_tab(session, site.links["researcher"])
             await tab.until(lambda: "alt+P" in tab.keys, "keys")
@@ -475,8 +475,8 @@ def test_what_researchers_do_is_in_the_log(site):
     run(go())
     lines = [(who, what, detail) for _, who, what, detail in site.trainer.store.audit.lines()]
     assert [line[1] for line in lines] == [
-        "came in", "took out ratings", "took out segments", "took out the data card", "took out comparisons",
-        "took out skips", "leave out", "came in", "paused the run",
+        "signed in", "downloaded ratings", "downloaded segments", "downloaded the data card",
+        "downloaded comparisons", "downloaded skips", "exclude", "signed in", "paused the run",
     ]  # fmt: skip
     assert {line[0] for line in lines} == {"ada"}
     assert lines[1][2] == "run=backflip-1" and lines[6][2] == "rater 2; run backflip-1"

@@ -52,13 +52,13 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site):
         assert len(store.ratings.for_training(run)) == 30
         assert page.locator(".od-nobody").count() == 0
         page.locator("tr", has_text="Ann").first.locator("[data-do]").click()
-        page.wait_for_selector(".od-nobody >> text=Everybody is left out of training.", timeout=20_000)
+        page.wait_for_selector(".od-nobody >> text=Everybody is excluded from training.", timeout=20_000)
         to_tab(page, "Watch")
         page.wait_for_selector(".od-nobody:visible >> text=goes on practising with the last predictor")
         assert site.trainer.store.ratings.count_for_training(run) == 0
         to_tab(page, "Data")
         for name in ("Ann", "Bob <i>"):
-            row = page.locator(".od-left-out", has_text=name).locator('[data-do="take in"]')
+            row = page.locator(".od-left-out", has_text=name).locator('[data-do="include"]')
             row.click()
             page.wait_for_selector(f'.od-left-out:has-text("{name}")', state="detached", timeout=20_000)
         until(lambda: store.ratings.left_out(run) == set())
@@ -123,7 +123,7 @@ def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, tmp_path)
             "/rollouts/1.jpg",
         ):
             assert page.request.get(site.url + path).status == 403, path
-        body = {"do": "leave out", "rater": 1}
+        body = {"do": "exclude", "rater": 1}
         origin = {"Origin": site.url}
         assert page.request.post(f"{site.url}/r/2/do", data=body, headers=origin).status == 403
 

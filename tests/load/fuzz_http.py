@@ -235,7 +235,7 @@ def hostile_request(rng: random.Random, cookie: str) -> bytes:
     bodies = (
         b"", b"{}", b"[" * 3000, b'{"press": "rate", "clip": 1e999}',
         b'{"press": "rate", "page": "x", "id": "1", "clip": 1, "value": 3, "mark": [0, 1]}', b"\xff\xfe",
-        b'{"do": "leave out", "rater": 2}', b'{"do": "new run"}', b"x" * 70_000,
+        b'{"do": "exclude", "rater": 2}', b'{"do": "new run"}', b"x" * 70_000,
     )  # fmt: skip
     path = rng.choice(paths)
     if rng.random() < 0.3:

@@ -26,7 +26,7 @@ class Score:
     """An evaluation: 16 deterministic episodes."""
 
     steps: int
-    """Control steps learned from so far."""
+    """Control steps used for training so far."""
     seconds: float
     """Wall time so far."""
     reward_mean: float
@@ -47,7 +47,7 @@ def judge(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple
     Args:
         task: A key of ``motion.TASK_REWARDS``.
         episodes: The evaluation.
-        steps: Control steps learned from so far.
+        steps: Control steps used for training so far.
         seconds: Wall time so far.
     """
     states = episodes.obs, episodes.actions, episodes.qpos, episodes.qvel

@@ -1,4 +1,4 @@
-"""Experiments over seeds, which can be broken off at any time and gone on with: a finished run is a file.
+"""Experiments over seeds, which can be interrupted at any time and resumed: a finished run is a file.
 
 A study is a list of jobs, each a kind of experiment with settings and a seed. What has been run before
 (by whichever study, under whichever label) is read from its file; the rest is run, each job in a process

@@ -76,7 +76,7 @@ def choose(
     if any_time:
         demo = rng.integers(demo_steps - clip_steps + 1, size=len(lanes))
     else:
-        # Beside the demo of the clip's middle: with an elastic clock both ends are then about as far off.
+        # Beside the demo of the clip's middle: where the phase adapts, both ends are then about as far off.
         middle = clip_steps // 2
         demo = np.maximum(rollouts.clock[lanes, starts + middle].astype(int) - middle, 0)
     within = np.flatnonzero(demo + clip_steps <= demo_steps)

@@ -38,7 +38,7 @@ class RatingsConfig:
     queue: int = 12
     """Clips kept ready to be rated."""
     stale_iterations: int = 10
-    """A clip that nobody has rated is withdrawn after so many iterations: the policy has moved on."""
+    """A clip that nobody has rated expires after so many iterations: the policy has moved on."""
     online_share: float = 0.5
     """A simulated rater gives its online ratings evenly over this first share of the training."""
 

@@ -160,7 +160,7 @@ class Snapshot(ABC):
         if fault := archive_fault(content):
             raise UserError(f"the predictor {path} is damaged ({fault}): restore it from a backup")
         data = torch.load(io.BytesIO(content), weights_only=True, map_location="cpu")
-        # Snapshots of before there were several kinds are the paper's network.
+        # Legacy snapshots without a kind are the paper's network.
         settings = {"kind": "network", "members": 1, "appearance": False} | data["config"]
         module = importlib.import_module(KINDS[settings["kind"]])
         return module.restore(data, PredictorConfig(**settings), device)
@@ -243,7 +243,7 @@ def fit_lens(features: np.ndarray, dims: int) -> Lens:
     """Centres frame features and turns them onto their principal components.
 
     Departs from the paper, which feeds all 4096 features: with a few hundred ratings, the few
-    directions in which one demo's frames differ are all that can be learned from. No rating and no
+    directions in which one demo's frames differ are all that can be used. No rating and no
     state enters. ``dims=0`` keeps every feature, standardised.
 
     Args:

@@ -1,4 +1,4 @@
-"""Where a clip goes wrong: a marked stretch is learned from as worse than the rest of its clip.
+"""Where a clip goes wrong: a marked stretch counts in training as worse than the rest of its clip.
 
 The paper leaves this to future work. The metric takes the marked steps to be further off than the others
 (``trainer/reward/learned_distance.py``). For the network, a rating with a mark becomes two: the others get

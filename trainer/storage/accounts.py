@@ -197,7 +197,7 @@ class Accounts:
     # Practice
 
     def has_practised(self, rater_id: int) -> bool:
-        """Whether a rater has done the practice clips, or rated before there were any."""
+        """Whether a rater has done the practice clips, or rated before practice existed."""
         return bool(
             self._database.rows(
                 "SELECT 1 FROM raters WHERE id = ?1 AND (practised_at IS NOT NULL"

@@ -1,4 +1,4 @@
-"""A log of who came in, took data out, or changed what others see. Written to, never changed."""
+"""A log of sign-ins, downloads, and changes to what others see. Written to, never changed."""
 
 from __future__ import annotations
 

@@ -236,7 +236,7 @@ class Ratings:
         return self._database.rows("SELECT MAX(id) FROM events")[0][0] or 0
 
     def for_training(self, run: str, as_of: int | None = None) -> list[Rating]:
-        """What was learned from as of event ``as_of`` (default: now): ratings of a run that held, in order.
+        """What was used for training as of event ``as_of`` (default: now): valid ratings of a run, in order.
 
         Not among them: second opinions, and ratings of raters who were left out.
 

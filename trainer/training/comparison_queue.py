@@ -109,7 +109,7 @@ class Pairing:
 
 
 _OLD = 10
-"""Iterations after which a pair that nobody answered is withdrawn."""
+"""Iterations after which a pair that nobody answered expires."""
 
 Place = tuple[int, int]
 """Lane and first step."""

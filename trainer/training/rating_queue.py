@@ -1,4 +1,4 @@
-"""Which clips people have before them: cut from the newest rollouts, rated, or withdrawn again.
+"""Which clips people have before them: cut from the newest rollouts, rated, or expired.
 
 A simulated rater answers at once, in the trainer's thread; people rate through the store.
 """
@@ -70,7 +70,7 @@ class Asking:
         return self._config.ratings.pretrain + self._config.ratings.online
 
     def given(self) -> int:
-        """Ratings that hold and are learned from."""
+        """Valid ratings that are used for training."""
         return self._store.ratings.count_for_training(self._run)
 
     def fill(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> None:

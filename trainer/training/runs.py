@@ -63,7 +63,7 @@ def find_run(
 
 
 def _of_before(file: Path) -> dict[str, Any]:
-    """What a config of before there were two methods leaves out: those runs are the paper's."""
+    """What a legacy config without a method leaves out: those runs are the paper's."""
     text = file.read_text()
     if re.search(r"^method = ", text, re.MULTILINE):
         return {}

@@ -26,7 +26,7 @@ _PRETRAIN_REFIT = 10
 _REST_S = (5.0, 300.0)
 """Before the first try after a failure, and at most: each rest is twice as long as the one before."""
 _MESSAGES = {
-    "pretrain": "So far the robot moves at random. It practises once it has learned from {} ratings.",
+    "pretrain": "So far the robot moves at random. It starts training once it has {} ratings.",
     "online": "The robot is practising with what it learned from your ratings.",
     "paused": "Practice is paused. Ratings still count.",
     "done": "The robot has practised as long as it was told to.",

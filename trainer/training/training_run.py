@@ -272,7 +272,7 @@ class TrainingRun:
         return self.learner
 
     def _true_reward(self, rollouts: Transitions) -> dict[str, float]:
-        """The hand-coded reward where the demo's task has one: shown, never learned from."""
+        """The hand-coded reward where the demo's task has one: shown, never used for training."""
         if self.demo.task not in TASK_REWARDS:
             return {}
         reward = TASK_REWARDS[self.demo.task](

@@ -38,7 +38,7 @@ def test_every_kind_of_press_is_read():
         RATE | {"clip": 2**53}, RATE | {"value": 0}, RATE | {"value": 6}, RATE | {"value": 2.5},
         RATE | {"mark": [1]}, RATE | {"mark": ["0", "1"]}, RATE | {"mark": [0.5, 1]},
         RATE | {"mark": [-1, 2]},
-        RATE | {"page": ""}, RATE | {"page": "x" * 65}, RATE | {"id": 5}, RATE | {"press": "leave out"},
+        RATE | {"page": ""}, RATE | {"page": "x" * 65}, RATE | {"id": 5}, RATE | {"press": "exclude"},
         {key: value for key, value in RATE.items() if key != "page"},
         REASON | {"reason": 7}, REASON | {"reason": " "}, REASON | {"reason": "a\nb"},
         REASON | {"reason": "x" * 201}, PRACTISE | {"do": "x"}, PRACTISE | {"exercise": -1},

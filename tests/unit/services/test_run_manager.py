@@ -105,13 +105,13 @@ def test_actions_take_the_fields_they_name_and_no_others(study):
     actions = Actions(Served(study))
     actions.do(ada, {"do": "open run", "run": "second"})
     assert study.trainer.run == "second"
-    actions.do(ada, {"do": "leave out", "rater": ada.id})
+    actions.do(ada, {"do": "exclude", "rater": ada.id})
     assert study._store.ratings.left_out("second") == {ada.id}
     for body in (
         None, [], {}, {"do": 1}, {"do": "fly"}, {"do": "open run"}, {"do": "open run", "run": 1},
         {"do": "open run", "run": "a\nb"}, {"do": "open run", "run": "x" * 101},
-        {"do": "leave out", "rater": True}, {"do": "leave out", "rater": 99},
-        {"do": "leave out", "rater": ada.id, "more": 1},
+        {"do": "exclude", "rater": True}, {"do": "exclude", "rater": 99},
+        {"do": "exclude", "rater": ada.id, "more": 1},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"action|rater|run is"):
             actions.do(Rater(id=ada.id, name="ada", role="researcher"), body)

@@ -86,7 +86,7 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
 
     Args:
         settings: And ``method``: "paper" practises by a fixed clock from standing starts, "onedemo" with
-            an elastic clock, a bank of starts and giving up; and ``set``, as in
+            an adaptive phase, a reset buffer and early termination; and ``set``, as in
             ``onedemo.experiments.jobs.method``.
         seed: Of everything random.
         scratch: Not used.

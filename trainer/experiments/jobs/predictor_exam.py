@@ -95,10 +95,10 @@ class Exam:
             )
 
         rng = np.random.default_rng([_STREAM, self._seed, 1])  # the same tries for all predictors
-        bank = fill_reset_buffer(snapshot, self._wild, frames_of, self._learner.demo_steps, rng)
+        buffer = fill_reset_buffer(snapshot, self._wild, frames_of, self._learner.demo_steps, rng)
         picked = [
             self._oracle.distance(qpos[None], qvel[None], int(step))[0]
-            for qpos, qvel, step in zip(bank.qpos, bank.qvel, bank.clock, strict=True)
+            for qpos, qvel, step in zip(buffer.qpos, buffer.qvel, buffer.clock, strict=True)
         ]
         return {
             "own": mean(self._steps),
