@@ -84,7 +84,7 @@ def test_a_table_from_its_plan_to_its_files(results, tmp_path):
 
 
 @pytest.mark.seam
-@pytest.mark.parametrize("switch", ["an elastic clock", "giving up"])
+@pytest.mark.parametrize("switch", ["an adaptive phase", "early termination"])
 def test_a_switch_of_the_ablation_changes_something(switch, plain, cache, tmp_path):
     assert plain["ratings"] == sum(plain["ratings_by_class"]) == 14
     other = document.plain(method.run(tiny(**ablation.off(ablation.SWITCHES[switch])), SEED, tmp_path, cache))

@@ -26,27 +26,27 @@ SWITCHES: Mapping[str, tuple[str, ...]] = {
     "clips from random states": ("ratings.starts",),
     "questions about any moment": ("ratings.pairing",),
     "chosen clips, in rounds": ("ratings.choice", "ratings.rounds"),
-    "appearance": ("predictor.appearance",),
+    "a pose estimator": ("predictor.appearance",),
     "a learned distance": ("predictor.kind",),
     "three predictors": ("predictor.members",),
-    "an elastic clock": ("practice.elastic",),
-    "starts from a bank": ("practice.bank_share",),
-    "giving up": ("practice.give_up",),
+    "an adaptive phase": ("practice.elastic",),
+    "starts from a reset buffer": ("practice.bank_share",),
+    "early termination": ("practice.give_up",),
     "a policy that sees the demo": ("policy.kind",),
     "a shrinking trust region": ("trpo.final_kl",),
 }
 """What each is called, and its settings."""
 
 ON: Mapping[str, tuple[str, ...]] = {
-    **{name: keys for name, keys in SWITCHES.items() if name != "appearance"},
+    **{name: keys for name, keys in SWITCHES.items() if name != "a pose estimator"},
     "principal components of the features": ("predictor.visual_dims",),
-    "a learned distance and appearance": (*SWITCHES["a learned distance"], *SWITCHES["appearance"]),
+    "a learned distance and a pose estimator": (*SWITCHES["a learned distance"], *SWITCHES["a pose estimator"]),
 }
-"""The same for the paper's method, whose network makes nothing of appearance alone; onedemo's distance
+"""The same for the paper's method, whose network makes nothing of a pose estimator alone; onedemo's distance
 makes nothing of principal components."""
 
 _OURS, _PAPER = "onedemo", "paper"
-_QUICK = {_OURS: ("an elastic clock", "giving up"), _PAPER: ("an elastic clock",)}
+_QUICK = {_OURS: ("an adaptive phase", "early termination"), _PAPER: ("an adaptive phase",)}
 
 
 def plan(seeds: tuple[int, ...], *, quick: bool) -> list[Job]:
