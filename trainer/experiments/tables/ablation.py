@@ -40,7 +40,7 @@ SWITCHES: Mapping[str, tuple[str, ...]] = {
 ON: Mapping[str, tuple[str, ...]] = {
     **{name: keys for name, keys in SWITCHES.items() if name != "a pose estimator"},
     "principal components of the features": ("predictor.visual_dims",),
-    "a learned distance and a pose estimator": (*SWITCHES["a learned distance"], *SWITCHES["a pose estimator"]),
+    "a learned distance and a pose estimator": ("predictor.kind", "predictor.appearance"),
 }
 """The same for the paper's method, whose network makes nothing of a pose estimator alone; onedemo's distance
 makes nothing of principal components."""
