@@ -290,7 +290,7 @@
     const place = form.parentElement.querySelector(".od-form-note");
     const fields = Object.fromEntries(new FormData(form));
     for (const input of form.querySelectorAll("[type=number]")) fields[input.name] = Number(input.value);
-    place.textContent = "One moment: the run at hand ends its iteration first.";
+    place.textContent = "One moment: the current run finishes its iteration first.";
     post("do", { do: form.dataset.act, ...fields }).catch((error) => (place.textContent = error.message));
   });
   // A video on its way: fetch tells nothing of how far it is, hence the older request.
@@ -307,7 +307,7 @@
     const request = new XMLHttpRequest();
     request.upload.onprogress = ({ loaded, total }) => {
       const share = Math.floor((100 * loaded) / total);
-      place.textContent = share < 100 ? `Uploading: ${share} %` : "The video is there and is being looked at.";
+      place.textContent = share < 100 ? `Uploading: ${share} %` : "Upload complete; the video is being checked.";
     };
     request.onload = () => {
       if (request.status !== 200) return done(request.responseText);
@@ -316,7 +316,7 @@
       form.reset();
       done(request.responseText);
     };
-    request.onerror = () => done("The connection broke off before the video had arrived. Please try again.");
+    request.onerror = () => done("The connection was lost during the upload. Please try again.");
     request.open("POST", form.dataset.upload);
     button.disabled = true;
     place.textContent = "Uploading";

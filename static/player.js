@@ -160,7 +160,7 @@ const clips = (() => {
       this.marking = null;
       marks.set(this.clip, mark);
       this.drawBar();
-      if (!mark) return this.say("Drag where it goes wrong, if you like");
+      if (!mark) return this.say("Optional: drag to mark where it goes wrong");
       const [from, to] = mark.map((frame) => (frame / this.fps).toFixed(2));
       this.say(`Goes wrong from ${from} to ${to} s`);
     }
@@ -171,7 +171,7 @@ const clips = (() => {
         this.seek(this.frame);
         this.marking = this.frame;
         this.drawBar();
-        return this.say("Step on to where it ends, then Mark again");
+        return this.say("Step forward to where it ends, then press Mark again");
       }
       const ends = [this.marking, this.frame].sort((a, b) => a - b);
       this.setMark([ends[0], ends[1] + 1]);

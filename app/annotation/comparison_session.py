@@ -78,7 +78,7 @@ class PairDesk:
                 self._assignment.release(self._holder, pair)
                 self._advance()
                 raise AnsweredElsewhere(
-                    "You had compared that pair at another page of yours: that answer stands."
+                    "You have already compared that pair on another page; that answer counts."
                 ) from None
             self._assignment.release(self._holder, pair)
             self._advance()

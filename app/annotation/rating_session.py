@@ -204,7 +204,7 @@ class Desk:
                 self._assignment.release(self._holder, clip)
                 self._advance()
                 raise AnsweredElsewhere(
-                    "You had rated that clip at another page of yours: that answer stands."
+                    "You have already rated that clip on another page; that answer counts."
                 ) from None
             self._kind = self._assignment.again.draw(self._rng)
             self._assignment.release(self._holder, clip)

@@ -39,7 +39,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         "spreadsheet would take for a formula begins with an apostrophe.\n\n" + as_table(RATINGS),
         "## Columns of the segments (Parquet)\n\nOne row a rated clip, key `clip_id`. The file's metadata "
         "`onedemo.training.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
-        "## Columns of the comparisons (CSV)\n\nAnswers to *Which of the two is nearer to the video?*\n\n"
+        "## Columns of the comparisons (CSV)\n\nAnswers to *Which of the two is closer to the video?*\n\n"
         + as_table(COMPARISONS),
         "## Limits\n\n"
         "- Names of raters are in the data. Replace them before you publish it, and ask the raters.\n"

@@ -68,7 +68,7 @@ COMPARISONS: dict[str, str] = {
     "run": "Training that the pair belongs to.",
     "demo": "Name of the demonstration video.",
     "rater": "Name of the rater.",
-    "answer": "Which clip is nearer to the video: left, right, or equal.",
+    "answer": "Which clip is closer to the video: left, right, or equal.",
     "stage": "pretrain: random motion; online: the policy in training.",
     "iteration": "Iteration of the policy whose motion the clips show; 0 in pretrain.",
     "created_at": "When the answer was given: UTC, ISO 8601, milliseconds.",

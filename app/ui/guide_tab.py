@@ -51,7 +51,7 @@ class Guide:
 
 
 _EXAMPLES = (
-    ("same", "5", "Twice the same moment."),
+    ("same", "5", "The same moment twice."),
     ("near", "4", "Moments that look nearly alike."),
     ("other", "2–3", "Moments with something in common."),
     ("far", "1", "Moments with nothing in common."),

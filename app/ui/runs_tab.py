@@ -35,7 +35,7 @@ class Runs:
         self._told = ""
         gui = context.client.gui
         self._table = gui.add_html("")
-        self._wanted = gui.add_text("Compare", "", hint="Names or parts of names, with commas between")
+        self._wanted = gui.add_text("Compare", "", hint="Names or parts of names, separated by commas")
         self._wanted.on_update(lambda _: self.refresh(self._training.status()))
         self._told_which = gui.add_html("")
         self._client, self._drawn = context.client, []
@@ -104,7 +104,7 @@ def chosen_runs(runs: Sequence[str], wanted: str, current: str) -> tuple[list[st
 
     Args:
         runs: All, oldest first.
-        wanted: Names or parts of names, with commas between; a whole name means that run alone. Nothing: the
+        wanted: Names or parts of names, separated by commas; a whole name means that run alone. Nothing: the
             newest, and the one at hand.
         current: The one at hand.
 

@@ -8,22 +8,22 @@ Keys = tuple[tuple[tuple[str, ...], str], ...]
 _PLAYING: Keys = (
     (("Space",), "play it again from the start"),
     (("F",), "slow motion, on and off"),
-    (("←", "→"), "one picture back or on"),
+    (("←", "→"), "one frame back or forward"),
 )
 _HELP: Keys = ((("?",), "show these keys"),)
 RATE_KEYS: Keys = (
     (("1", "2", "3", "4", "5"), "rate the pair; the next one follows at once"),
-    (("U",), "take your last rating back, as often as you like (also Backspace)"),
+    (("U",), "undo your last rating, and those before it (also Backspace)"),
     (("S",), "skip this pair; you may say why"),
     *_PLAYING,
     (("M",), "mark where it goes wrong: once at the start, once at the end"),
     *_HELP,
 )
 COMPARE_KEYS: Keys = (
-    (("1",), "the left one is nearer to the video"),
-    (("2",), "both are alike"),
-    (("3",), "the right one is nearer to the video"),
-    (("U",), "take your last answer back, as often as you like (also Backspace)"),
+    (("1",), "the left one is closer to the video"),
+    (("2",), "about the same"),
+    (("3",), "the right one is closer to the video"),
+    (("U",), "undo your last answer, and those before it (also Backspace)"),
     (("S",), "skip these two"),
     *_PLAYING,
     *_HELP,

@@ -200,7 +200,7 @@ def test_undo_and_skip(chromium, site):
         shown_clip(page)
         assert press_and_wait(page, site, lambda: page.keyboard.press("u")) == ("undo", second, None, "bo")
         page.wait_for_selector(f'.od-clip .od-player[data-clip="{second}"]')
-        page.wait_for_selector(".od-notice >> text=Taken back: you had skipped it. What do you say now?")
+        page.wait_for_selector(".od-notice >> text=Undone: you skipped it. Rate it again.")
         assert press_and_wait(page, site, lambda: page.keyboard.press("Backspace")) == (
             "undo",
             first,
@@ -208,7 +208,7 @@ def test_undo_and_skip(chromium, site):
             "bo",
         )
         assert shown_clip(page) == first
-        page.wait_for_selector(".od-notice >> text=Taken back: you had said 1: Not at all.")
+        page.wait_for_selector(".od-notice >> text=Undone: you rated it 1: Not at all.")
         press_and_wait(page, site, lambda: page.keyboard.press("2"))
         page.wait_for_selector(".od-notice", state="detached")
         assert [row[1:6:4] for row in site.trainer.store.ratings.stream()] == [(first, 2)]

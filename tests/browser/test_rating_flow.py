@@ -189,7 +189,7 @@ def test_on_a_slow_line_a_press_is_for_the_clip_that_was_on_screen(chromium, sit
         until(lambda: page.wait_for_timeout(50) or len(site.events()) == 2)
         page.unroute("**/press")
         assert site.events() == [("rate", clip, 2, "bo"), ("undo", clip, None, "bo")]
-        page.wait_for_selector(".od-notice >> text=Taken back: you had said 2")
+        page.wait_for_selector(".od-notice >> text=Undone: you rated it 2")
         assert shown_clip(page) == clip
         press_and_wait(page, site, lambda: page.keyboard.press("4"))
 
@@ -200,7 +200,7 @@ def test_the_same_clip_answered_at_another_page_is_said(chromium, site):
         rater = {rater.name: rater.id for rater in site.trainer.store.accounts.raters()}["bo"]
         site.trainer.store.ratings.rate(clip, rater, 1, 900)
         page.keyboard.press("4")
-        page.wait_for_selector(".od-problem >> text=You had rated that clip at another page of yours")
+        page.wait_for_selector(".od-problem >> text=You have already rated that clip on another page")
         assert shown_clip(page) != clip
         press_and_wait(page, site, lambda: page.keyboard.press("4"))
         assert [event[2] for event in site.events()] == [1, 4]

@@ -378,7 +378,7 @@ def test_a_clip_that_was_rated_at_another_page_of_the_same_person_is_let_go(stor
     assert second.current == first.current == 1
     clock.now += 1
     assert second.rate(1, 4)
-    with pytest.raises(AnsweredElsewhere, match="at another page of yours"):
+    with pytest.raises(AnsweredElsewhere, match="on another page"):
         first.rate(1, 2)
     assert first.current != 1
     clock.now += 1
