@@ -1,4 +1,4 @@
-"""Which clip of the agent is asked against which clip of the demo: decided here and nowhere else.
+"""Which clips are cut from rollouts, and beside which part of the demo; who is shown which is the page's matter.
 
 Shapes: N lanes, T control steps, W control steps a clip, n candidates.
 """
