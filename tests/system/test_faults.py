@@ -215,5 +215,5 @@ def test_nothing_goes_by_the_clock_on_the_wall():
         text = path.read_text()
         assert not re.search(r"\btime\.time\(", text), path
         assert path.name in stamps or not re.search(r"datetime\.(now|today)\(", text), path
-        for order in re.findall(r"(?:ORDER BY|MAX\()[^\"']*", text):
+        for order in re.findall(r"(?:ORDER BY|MAX\()[^\"'\n]*", text):
             assert "_at" not in order, f"{path}: {order}"

@@ -1,4 +1,4 @@
-"""Which clips are cut from rollouts, and beside which part of the demo; who is shown which is the page's matter.
+"""Which clips are cut from rollouts, and beside which part of the demo; the page decides who sees which.
 
 Shapes: N lanes, T control steps, W control steps a clip, n candidates.
 """

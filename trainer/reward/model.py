@@ -1,4 +1,4 @@
-"""The similarity predictor: from a demo frame and a robot's state and action to a rating of 1 to 5.
+"""The reward model: from a demo frame and a robot's state and action to a rating of 1 to 5.
 
 Here is what all kinds have in common: settings, what they see of the demo, and the snapshot that a fit
 gives. ``trainer/reward/two_branch_net.py`` is the paper's network, ``trainer/reward/learned_distance.py``

@@ -40,7 +40,7 @@ from onedemo.training.rating_queue import Asking, Simulated
 from onedemo.types import Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import Track
-from onedemo.vision.pose_estimator import learn as learn_appearance
+from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 
 class TrainingRun:
@@ -157,7 +157,7 @@ class TrainingRun:
         if not self.config.predictor.appearance:
             return features, None
         self.preparing = "Looking at pictures of the robot: about a minute, the first time only."
-        look = learn_appearance(self.config.env, self._encoder, self._cache_dir / "robots", check)
+        look = learn_pose_estimator(self.config.env, self._encoder, self._cache_dir / "robots", check)
         return features, look.track(features, self.demo.fps) if look.knows(features) else None
 
     def see(self, features: np.ndarray, track: Track | None) -> None:

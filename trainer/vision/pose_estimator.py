@@ -57,7 +57,7 @@ class Track:
     """(F, P), float32, as ``body.motion``."""
 
 
-class Appearance:
+class PoseEstimator:
     """Regresses the pose from frame features: a few small networks, averaged.
 
     Args:
@@ -111,7 +111,7 @@ def _go_on() -> None:
 def learn(
     env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on, *,
     count: int | None = None,
-) -> Appearance:  # fmt: skip
+) -> PoseEstimator:  # fmt: skip
     """Learns what the robot looks like, or takes what was learned before.
 
     Args:
@@ -129,7 +129,7 @@ def learn(
     path = cache_dir / f"{env_name}-{model}-{encoder.name}-v{_VERSION}.npz"
     if (data := read_whole(path)) is not None:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            return Appearance(stored)
+            return PoseEstimator(stored)
     appearance = regress(*pictures(env_name, encoder, count or PICTURES, check), check)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)
@@ -166,7 +166,7 @@ def pictures(
     return features, kinematics.pose(qpos[:, 1:]).astype(np.float32)
 
 
-def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> Appearance:
+def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> PoseEstimator:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
 
     One thread computes: several would add up in another order, and runs with another number of
@@ -185,7 +185,7 @@ def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] =
         torch.set_num_threads(threads)
 
 
-def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None]) -> Appearance:
+def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None]) -> PoseEstimator:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
     inputs, targets = torch.from_numpy((features - mean) / std), torch.from_numpy(poses)
@@ -210,7 +210,7 @@ def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None])
                 optimiser.step()
                 schedule.step()
         tensors |= {f"{member}.{name}": x.detach().numpy().copy() for name, x in net.state_dict().items()}
-    appearance = Appearance(tensors)
+    appearance = PoseEstimator(tensors)
     error = np.square(appearance.poses(features[train:]) - poses[train:]).sum(axis=0)
     spread = np.square(poses[train:] - poses[train:].mean(axis=0)).sum(axis=0)
     appearance.held_out = appearance.tensors["held_out"] = 1 - error / spread

@@ -299,7 +299,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
             rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
         )
 
-    monkeypatch.setattr("onedemo.training.training_run.learn_appearance", look)
+    monkeypatch.setattr("onedemo.training.training_run.learn_pose_estimator", look)
     trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
     trainer_.start()
     for _ in range(3):
@@ -572,7 +572,7 @@ ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
 
 @pytest.mark.seam
 def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path, few_pictures):
-    """Appearance, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
+    """PoseEstimator, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
     demo = drawn_demo(tmp_path / "demo")
     learner, snapshot = learns_the_same_from_noise(
         demo, tmp_path, small_config(**ONEDEMO, rollouts__total_steps=800)

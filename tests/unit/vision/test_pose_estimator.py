@@ -12,7 +12,7 @@ from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 from onedemo.sim import kinematics
 from onedemo.vision import pose_estimator
 from onedemo.vision.encoders import make_encoder
-from onedemo.vision.pose_estimator import Appearance, learn, pictures, regress
+from onedemo.vision.pose_estimator import PoseEstimator, learn, pictures, regress
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -74,7 +74,7 @@ def test_the_same_pictures_give_the_same_networks_on_any_number_of_threads(poses
 
 def test_it_is_made_again_from_its_tensors(poses, quick):
     one = regress(seen(poses), poses)
-    two = Appearance(one.tensors)
+    two = PoseEstimator(one.tensors)
     np.testing.assert_array_equal(one.poses(seen(poses)), two.poses(seen(poses)))
     np.testing.assert_array_equal(one.held_out, two.held_out)
 
@@ -85,7 +85,7 @@ def test_strangeness_is_about_one_for_what_it_learned_from(poses, quick):
     assert learned.strangeness(10 * seen(poses)) > 50 and not learned.knows(10 * seen(poses))
 
 
-class PerfectEye(Appearance):
+class PerfectEye(PoseEstimator):
     """Its features are the pose."""
 
     def __init__(self):

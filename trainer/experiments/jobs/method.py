@@ -39,7 +39,7 @@ from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo
 from onedemo.vision.encoders import demo_features, make_encoder
-from onedemo.vision.pose_estimator import learn as learn_appearance
+from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 POINTS = 12
 """Of a learning curve."""
@@ -152,7 +152,7 @@ def prepare(demo: Demo, config: RunConfig, cache: Path) -> Any:
         demo_features(demo, encoder, cache / "demos")
     if config.predictor.appearance:
         with hold(cache / "robots" / "lock", wait=True):
-            learn_appearance(config.env, encoder, cache / "robots")
+            learn_pose_estimator(config.env, encoder, cache / "robots")
     return encoder
 
 
