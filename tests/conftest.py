@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,17 +24,31 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where runs of the tests are kept, with a cache of what they share: robot and demos are looked at once.
+def looked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data directory that knows robot and demo already, to be copied: made once for all processes.
 
-    The robot is learned from fewer pictures than it is for people: a minute less.
+    The robot is learned from fewer pictures than it is for people: poor, but a minute less.
     """
+    from onedemo.core.files import hold
+    from onedemo.demos.library import find_demo
     from onedemo.vision import pose_estimator
-    from onedemo.vision.encoders import make_encoder
+    from onedemo.vision.encoders import demo_features, make_encoder
 
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    directory = shared / "looked"
+    with hold(shared / "looked.lock", wait=True):
+        encoder = make_encoder("efficientnet-lite0")
+        pose_estimator.learn("hopper", encoder, directory / "robots", count=300)
+        demo_features(find_demo("hopper-backflip", directory / "demos"), encoder, directory / "demos")
+    return directory
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory: pytest.TempPathFactory, looked: Path) -> Path:
+    """Where runs of the tests are kept, with a cache of what they share."""
     directory = tmp_path_factory.mktemp("results")
-    encoder = make_encoder("efficientnet-lite0")
-    pose_estimator.learn("hopper", encoder, directory / "cache" / "robots", count=600)
+    shutil.copytree(looked, directory / "cache")
     return directory
 
 
@@ -54,19 +69,6 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=path, args=CHROMIUM_FLAGS)
         yield browser
         browser.close()
-
-
-@pytest.fixture(scope="session")
-def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the robot looks like, to be copied into a data directory: of few pictures, poor, but quick."""
-    from onedemo.vision import pose_estimator
-    from onedemo.vision.encoders import make_encoder
-
-    directory = tmp_path_factory.mktemp("looked") / "robots"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_estimator, "PICTURES", 300)
-        pose_estimator.learn("hopper", make_encoder("efficientnet-lite0"), directory)
-    return directory
 
 
 @dataclass

@@ -33,8 +33,8 @@ QUICK = ["--port", "0", *(word for key, value in SETTINGS.items() for word in ("
 
 
 @pytest.fixture
-def serving(tmp_path, robots):
-    shutil.copytree(robots, tmp_path / "data" / "robots")
+def serving(tmp_path, looked):
+    shutil.copytree(looked, tmp_path / "data")
     serving = Serving(tmp_path / "data")
     yield serving
     serving.close()

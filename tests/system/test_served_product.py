@@ -18,10 +18,10 @@ pytestmark = pytest.mark.seam
 
 
 @pytest.fixture(scope="module")
-def data_dir(tmp_path_factory, robots):
+def data_dir(tmp_path_factory, looked):
     """Shared, so that the demo is looked at once; what the robot looks like is known, roughly."""
     directory = tmp_path_factory.mktemp("bench") / "data"
-    shutil.copytree(robots, directory / "robots")
+    shutil.copytree(looked, directory)
     return directory
 
 

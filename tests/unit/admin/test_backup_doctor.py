@@ -366,10 +366,10 @@ def test_the_doctor_says_when_nothing_can_be_drawn(tmp_path):
 
 
 @pytest.mark.seam
-def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, robots):
+def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, looked):
     """People rate at a real server while it is saved; the restored one knows them, and all they had said."""
     data_dir, file, again = tmp_path / "data", tmp_path / "all.zip", tmp_path / "again"
-    shutil.copytree(robots, data_dir / "robots")
+    shutil.copytree(looked, data_dir)
 
     async def rate(link, count, beside=None):
         async with browser_session() as session:

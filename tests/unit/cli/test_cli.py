@@ -142,8 +142,8 @@ def test_every_method_can_be_asked_for():
 
 
 @pytest.mark.seam
-def test_the_headless_run_of_the_readme(tmp_path, capsys, robots):
-    shutil.copytree(robots, tmp_path / "robots")
+def test_the_headless_run_of_the_readme(tmp_path, capsys, looked):
+    shutil.copytree(looked, tmp_path, dirs_exist_ok=True)
     out = tmp_path / "summary.json"
     words = "train --demo hopper-backflip --rater oracle --ratings 40 --steps 100000 --seed 0"
     assert main([*words.split(), "--data-dir", str(tmp_path), "--json", str(out)]) == 0

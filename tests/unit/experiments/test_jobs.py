@@ -37,12 +37,6 @@ def cache(results):
     return results / "cache"
 
 
-@pytest.fixture(scope="module")
-def plain(cache, tmp_path_factory):
-    """The smallest run, to compare others with."""
-    return document.plain(method.run(tiny(), SEED, tmp_path_factory.mktemp("plain"), cache))
-
-
 def quicker(job):
     """A job of the quick form with a rougher predictor."""
     if job.kind != "method":
@@ -84,18 +78,17 @@ def test_a_table_from_its_plan_to_its_files(results, tmp_path):
 
 
 @pytest.mark.seam
-@pytest.mark.parametrize("switch", ["an adaptive phase", "early termination"])
-def test_a_switch_of_the_ablation_changes_something(switch, plain, cache, tmp_path):
+def test_a_switch_of_the_ablation_and_a_predictor_of_another_move_change_something(cache, tmp_path):
+    plain = document.plain(method.run(tiny(), SEED, tmp_path / "plain", cache))
     assert plain["ratings"] == sum(plain["ratings_by_class"]) == 14
-    other = document.plain(method.run(tiny(**ablation.off(ablation.SWITCHES[switch])), SEED, tmp_path, cache))
+    switched = tiny(**ablation.off(ablation.SWITCHES["an adaptive phase"]))
+    other = document.plain(method.run(switched, SEED, tmp_path / "other", cache))
     assert other["ratings"] == 14 and other["env_steps"] == plain["env_steps"]
     assert other["figures"] != plain["figures"]
-
-
-@pytest.mark.seam
-def test_a_predictor_of_another_move_changes_something(plain, cache, tmp_path):
     source = {**tiny(), "demo": "hopper-hop", "ratings": 21}
-    tuned = document.plain(transfer.run({"source": source, "target": tiny()}, SEED, tmp_path, cache))
+    tuned = document.plain(
+        transfer.run({"source": source, "target": tiny()}, SEED, tmp_path / "tuned", cache)
+    )
     assert tuned["ratings"] == plain["ratings"] and tuned["source"]["ratings"] == 21
     assert tuned["curve"]["env_steps"] == plain["curve"]["env_steps"]
     assert tuned["demo_rated"] != plain["demo_rated"] and tuned["figures"] != plain["figures"]
@@ -107,28 +100,21 @@ def test_a_run_on_the_persons_video(cache, tmp_path):
         person.video()
     except UserError:
         pytest.skip(f"{person.VARIABLE} names no video")
-    found = []
-    for changes in (person_table.CHANGES, {}):
-        settings = {k: v for k, v in tiny(**changes).items() if k != "demo"} | {"rater": "script"}
-        found.append(document.plain(person.run(settings, SEED, tmp_path / str(len(found)), cache)))
-    for result in found:
-        assert result["ratings"] == sum(result["ratings_by_class"]) == 14
-        assert sum(n > 0 for n in result["ratings_by_class"]) >= 3, "the rater tells clips apart"
-        assert len(result["episode"]["qpos"]) == 66 and result["demo_rated"] is None
-        each = [result["figures"][name]["each"] for name in ("farthest_turn", "turned")]
-        assert len(each[0]) == 16 and all(far >= turned for far, turned in zip(*each, strict=True))
-    assert found[0]["figures"] != found[1]["figures"], "the clock's slack changes something"
+    settings = {k: v for k, v in tiny(**person_table.CHANGES).items() if k != "demo"} | {"rater": "script"}
+    result = document.plain(person.run(settings, SEED, tmp_path, cache))
+    assert result["ratings"] == sum(result["ratings_by_class"]) == 14
+    assert sum(n > 0 for n in result["ratings_by_class"]) >= 3, "the rater tells clips apart"
+    assert len(result["episode"]["qpos"]) == 66 and result["demo_rated"] is None
+    each = [result["figures"][name]["each"] for name in ("farthest_turn", "turned")]
+    assert len(each[0]) == 16 and all(far >= turned for far, turned in zip(*each, strict=True))
 
 
 @pytest.mark.seam
-def test_comparisons_change_what_is_learned(tmp_path):
-    settings = {"demo": "hopper-backflip", "steps": 1}
-    few, more = (
-        document.plain(controls.preferences(settings | {"comparisons": n}, SEED, tmp_path)) for n in (4, 8)
-    )
-    assert (few["ratings"], more["ratings"]) == (4, 8)
-    assert -1 <= few["reward_correlation"] <= 1
-    assert few["figures"] != more["figures"] and len(few["figures"]["net_turns"]["each"]) == 16
+def test_a_policy_from_comparisons(tmp_path):
+    settings = {"demo": "hopper-backflip", "steps": 1, "comparisons": 4}
+    result = document.plain(controls.preferences(settings, SEED, tmp_path))
+    assert result["ratings"] == 4 and -1 <= result["reward_correlation"] <= 1
+    assert len(result["figures"]["net_turns"]["each"]) == 16
 
 
 @pytest.mark.seam
