@@ -165,7 +165,8 @@ def test_the_headless_run_of_the_readme(tmp_path, capsys, looked):
 
 
 @pytest.fixture
-def serving(tmp_path):
+def serving(tmp_path, looked):
+    shutil.copytree(looked, tmp_path / "data")
     serving = Serving(tmp_path / "data")
     yield serving
     serving.close()
