@@ -79,7 +79,7 @@
     } catch (error) {
       if (!["TypeError", "TimeoutError"].includes(error.name)) throw error; // it was answered
       if (tries === 1)
-        throw new Error("There is no connection: that was not saved. Nothing else is lost: please press again.");
+        throw new Error("There is no answer from the server: your last press may not have been saved. Look at what is on screen before you press again.");
     }
     await new Promise((go) => setTimeout(go, 500));
     return deliver(body, tries - 1);
@@ -115,11 +115,15 @@
   function undo() {
     const player = main();
     const button = shown("[data-undo-clip], [data-undo-pair]");
-    const { clip, pair } = player?.answered ? player.element.dataset : {};
+    const { clip, pair } = player?.answered && !player.undone ? player.element.dataset : {};
     const { undoClip = clip, undoPair = pair } = clip || pair ? {} : (button?.dataset ?? {});
-    if (player) player.answered = false;
-    if (undoPair) send({ press: "compare", pair: Number(undoPair), answer: "undo" });
-    else if (undoClip) send({ press: "undo", clip: Number(undoClip) });
+    if (!undoPair && !undoClip) return;
+    const press = undoPair
+      ? { press: "compare", pair: Number(undoPair), answer: "undo" }
+      : { press: "undo", clip: Number(undoClip) };
+    // Not answered anew before it is taken back: that press would come too early to count.
+    if (player) player.undone = player.answered;
+    send(press).then(() => player?.undone && (player.answered = player.undone = false));
   }
 
   function sayWhy(box, reason) {

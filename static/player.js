@@ -160,7 +160,7 @@ const clips = (() => {
       this.marking = null;
       marks.set(this.clip, mark);
       this.drawBar();
-      if (!mark) return this.say("Optional: drag to mark where it goes wrong");
+      if (!mark) return this.say("Drag to mark where it goes wrong");
       const [from, to] = mark.map((frame) => (frame / this.fps).toFixed(2));
       this.say(`Goes wrong from ${from} to ${to} s`);
     }

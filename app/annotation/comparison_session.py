@@ -5,6 +5,8 @@ As ``onedemo.app.annotation.rating_session``.
 
 from __future__ import annotations
 
+import logging
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -14,6 +16,8 @@ from onedemo.app.annotation.rating_session import GUARD_SECONDS, AnsweredElsewhe
 from onedemo.storage.ratings import AlreadyAnswered
 from onedemo.storage.store import Store
 from onedemo.types import Rater
+
+log = logging.getLogger("onedemo.page")
 
 
 class PairDesk:
@@ -81,7 +85,11 @@ class PairDesk:
                     "You have already compared that pair on another page; that answer counts."
                 ) from None
             self._assignment.release(self._holder, pair)
-            self._advance()
+            self.current = None
+            try:
+                self._advance()
+            except sqlite3.Error:  # the answer is kept all the same; `refill` looks again
+                log.exception("no next pair could be looked for")
             return True
 
     def undo(self, pair: int) -> bool:

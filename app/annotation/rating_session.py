@@ -7,7 +7,9 @@ before the desk moves on; if the commit fails the clip stays. What may be taken 
 
 from __future__ import annotations
 
+import logging
 import random
+import sqlite3
 import threading
 import time
 from collections.abc import Callable, Hashable
@@ -19,6 +21,8 @@ from onedemo.reward.segment_marks import Mark, picture_of_step, pictures_of_step
 from onedemo.storage.ratings import AlreadyAnswered, LastAnswer
 from onedemo.storage.store import Store
 from onedemo.types import Demo, Rater
+
+log = logging.getLogger("onedemo.page")
 
 GUARD_SECONDS = 0.3
 """A clip lasts about 0.3 s: a rating that comes sooner was not made for it."""
@@ -110,7 +114,10 @@ class Desk:
         with self._lock:
             before = self._current, self._upcoming
             if self._current is None:
+                skipped, explained = self._skipped, self.explained
                 self._advance()
+                if self._current is None:  # the reason of the last skip may still be said
+                    self._skipped, self.explained = skipped, explained
             elif self._upcoming is None:
                 self._upcoming = self._pick(self._waiting())
             return before != (self._current, self._upcoming)
@@ -162,7 +169,10 @@ class Desk:
         with self._lock:
             if self._skipped is None or clip != self._skipped.clip:
                 return False
-            self._store.ratings.skip(clip, self.rater.id, 0, reason=reason, repeat=self._skipped.repeat)
+            repeat = self._skipped.repeat
+            if not self._store.ratings.holds(clip, self.rater.id, repeat=repeat):
+                return False  # taken back at another page
+            self._store.ratings.skip(clip, self.rater.id, 0, reason=reason, repeat=repeat)
             self._skipped, self.explained = None, True
             return True
 
@@ -208,7 +218,11 @@ class Desk:
                 ) from None
             self._kind = self._assignment.again.draw(self._rng)
             self._assignment.release(self._holder, clip)
-            self._advance()
+            self._current = None
+            try:
+                self._advance()
+            except sqlite3.Error:  # the answer is kept all the same; `refill` looks again
+                log.exception("no next clip could be looked for")
             return ask
 
     def _latency_ms(self) -> int:

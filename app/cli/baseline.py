@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from onedemo.app.cli.data import DATA, DataDir, open_store
+from onedemo.app.cli.data import DATA, DataDir, Whole, open_store
 
 baseline = App(name="baseline", help="What the method is compared with.")
 Prefix = Annotated[Path, Parameter(help="Where to write PREFIX.json, .policy.pt and .hidden.npz.")]
@@ -16,8 +16,8 @@ Prefix = Annotated[Path, Parameter(help="Where to write PREFIX.json, .policy.pt 
 
 @baseline.command
 def trpo(
-    *, out: Prefix, task: Literal["backflip", "hop"] = "backflip", steps: int = 3_000_000, seed: int = 0,
-    lanes: int = 64, physics: Literal["mujoco", "warp"] = "mujoco", device: str = "cpu",
+    *, out: Prefix, task: Literal["backflip", "hop"] = "backflip", steps: Whole = 3_000_000, seed: Whole = 0,
+    lanes: Whole = 64, physics: Literal["mujoco", "warp"] = "mujoco", device: str = "cpu",
 ) -> None:  # fmt: skip
     """TRPO on a hand-coded reward.
 
@@ -48,8 +48,8 @@ def trpo(
 
 @baseline.command
 def preferences(
-    *, out: Prefix, comparisons: int = 350, from_run: str | None = None, data_dir: DataDir = DATA,
-    steps: int = 3_000_000, seed: int = 0,
+    *, out: Prefix, comparisons: Whole = 350, from_run: str | None = None, data_dir: DataDir = DATA,
+    steps: Whole = 3_000_000, seed: Whole = 0,
 ) -> None:  # fmt: skip
     """Learning from comparisons of two segments.
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
+from onedemo.app.cli.data import Whole
 from onedemo.core.files import check_writable, write_atomic
 from onedemo.errors import UserError
 from onedemo.experiments.registry import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
@@ -66,7 +67,7 @@ def _table(name: str) -> Any:
 
     def table(
         *, seeds: Seeds = None, quick: Quick = False, json_: Json = None, out: Out = None,
-        results: Path = Path("bench-results"), workers: int | None = None, report_only: bool = False,
+        results: Path = Path("bench-results"), workers: Whole | None = None, report_only: bool = False,
     ) -> int:  # fmt: skip
         """A table.
 

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from onedemo.core.files import check_writable
 from onedemo.errors import UserError
 
 DATA = Path("data")
 DataDir = Annotated[Path, Parameter(help="Where everything is kept.")]
+
+
+def _whole(kind: Any, tokens: Sequence[Token]) -> int:
+    return int(tokens[0].value)  # cyclopts would round 1.5
+
+
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 def check_output(file: Path, data_dir: Path) -> None:

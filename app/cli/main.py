@@ -14,6 +14,7 @@ from cyclopts import (
     Parameter,
     UnknownCommandError,
     UnknownOptionError,
+    UnusedCliTokensError,
 )
 
 from onedemo.core.process import prepare_process
@@ -81,7 +82,7 @@ def _app() -> App:
         version=_version,
         help_format="plaintext",
         help_formatter="plain",
-        default_parameter=Parameter(negative=()),
+        default_parameter=Parameter(negative=(), allow_repeating=True),  # the last one holds
     )
     for place, summary in _COMMANDS.items():
         name = place.split(":")[1].rstrip("_")
@@ -97,11 +98,16 @@ def _sentence(error: CycloptsError) -> str:
         nearest = difflib.get_close_matches(word, options, n=1, cutoff=0.5)
         return f"unknown option {word}" + (f"; did you mean {nearest[0]}?" if nearest else "")
     if isinstance(error, UnknownCommandError):
-        return f"invalid choice: {(error.unused_tokens or ['?'])[0]!r}"
+        word = (error.unused_tokens or ["?"])[0]
+        known = sorted(name for name in error.app if not name.startswith("-")) if error.app else []
+        return f"invalid choice: {word!r}; choose from {', '.join(known)}"
     if isinstance(error, CoercionError) and error.token is not None:
-        kind = getattr(error.target_type, "__name__", "")
-        wrong = f"invalid {kind} value" if kind in ("int", "float") else "invalid choice"
+        kinds = getattr(error.target_type, "__args__", (error.target_type,))
+        number = next((kind.__name__ for kind in kinds if kind in (int, float)), "")
+        wrong = f"invalid {number} value" if number else "invalid choice"
         return f"argument {error.token.keyword}: {wrong}: {error.token.value!r}"
+    if isinstance(error, UnusedCliTokensError):
+        return f"unexpected argument: {' '.join(error.unused_tokens or ())}"
     said = " ".join(str(error).split()).rstrip(".")
     return said[:1].lower() + said[1:]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cyclopts import App
 
-from onedemo.app.cli.data import DATA, DataDir, check_output, open_store
+from onedemo.app.cli.data import DATA, DataDir, Whole, check_output, open_store
 from onedemo.errors import UserError
 
 COMMAND_LINE = "command line"
@@ -70,7 +70,7 @@ def links(*, data_dir: DataDir = DATA) -> None:
 
 
 @rater.command
-def revoke(name: str | None = None, /, *, link: int | None = None, data_dir: DataDir = DATA) -> None:
+def revoke(name: str | None = None, /, *, link: Whole | None = None, data_dir: DataDir = DATA) -> None:
     """End a rater's links and open pages; ratings stay.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from onedemo.app.cli.data import DATA, DataDir, check_output
+from onedemo.app.cli.data import DATA, DataDir, Whole, check_output
 from onedemo.config import describe, load_config, parse_override, split_ratings
 from onedemo.errors import UserError
 
@@ -27,7 +27,7 @@ class RunOptions:
     """Resume this run, or name a new one."""
     method: Literal["onedemo", "paper"] | None = None
     """How to learn: onedemo (default), or as in the paper."""
-    seed: int | None = None
+    seed: Whole | None = None
     """Of all random numbers [default: 0]."""
     device: str | None = None
     """Of predictor and policy: cpu (default) or cuda."""
@@ -61,7 +61,7 @@ def settings_help() -> str:
 
 def serve(
     options: RunOptions = NONE, *,
-    host: str = "127.0.0.1", port: int = 8080, tls_cert: Path | None = None, tls_key: Path | None = None,
+    host: str = "127.0.0.1", port: Whole = 8080, tls_cert: Path | None = None, tls_key: Path | None = None,
     behind_proxy: bool = False, allow_host: list[str] | None = None, new_run: bool = False,
     shared: float = 0.1, repeated: float = 0.04, compare: bool = False,
 ) -> None:  # fmt: skip
@@ -113,7 +113,7 @@ def serve(
 
 def train(
     options: RunOptions = NONE, *,
-    rater: str = "oracle", ratings: int | None = None, steps: int | None = None,
+    rater: str = "oracle", ratings: Whole | None = None, steps: Whole | None = None,
     predictor_from: str | None = None, json_: Annotated[Path | None, Parameter("--json")] = None,
     quiet: bool = False,
 ) -> None:  # fmt: skip

@@ -113,7 +113,10 @@ class Page:
         for session in sessions:
             if session.token == press.page and session.rater.id == rater_id:
                 return session.press(press)
-        raise PageGone("This page had lost its connection. Please press again once it is back.")
+        raise PageGone(
+            "This page had lost its connection. Look at the clip that is shown now: "
+            "your last answer may have been saved."
+        )
 
     # One session per browser
 
@@ -167,7 +170,11 @@ class Page:
                 sessions = list(self._sessions.values())
             if not sessions:
                 continue
-            status = self.trainer.status()
+            try:
+                status = self.trainer.status()
+            except Exception:  # the database may be busy
+                log.exception("the training does not say how it is")
+                continue
             for session in sessions:
                 try:
                     session.refresh(status)

@@ -6,6 +6,7 @@ nothing, and it costs no messages.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 from collections.abc import Callable
@@ -16,6 +17,8 @@ from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.templates import render
 from onedemo.app.ui.context import TabContext
 from onedemo.types import Status
+
+log = logging.getLogger("onedemo.page")
 
 _BRAND = (47, 93, 196)
 _KEPT = 100
@@ -89,8 +92,11 @@ class Pressing:
         raise NotImplementedError
 
     def _draw_now(self) -> None:
-        self._draw()
-        self._client.flush()
+        try:
+            self._draw()
+            self._client.flush()
+        except Exception:  # the press counts all the same; the next tick draws again
+            log.exception("a page could not be drawn")
 
     def _put(self, handle: Any, content: str) -> None:
         # Setting the same HTML again would start its clip over.

@@ -148,7 +148,7 @@ def test_a_press_that_does_not_arrive_says_so_and_loses_nothing(chromium, site):
         page.route("**/press", lambda route: route.abort())
         mark_by_dragging(page, 0.05, 0.15)
         page.keyboard.press("2")
-        page.wait_for_selector(".od-problem >> text=There is no connection")
+        page.wait_for_selector(".od-problem >> text=There is no answer from the server")
         assert site.events() == []
         assert page.locator(".od-wrong").bounding_box()["width"] > 10  # still there
         page.unroute("**/press")
@@ -235,7 +235,7 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
         page.keyboard.press("m")
         page.keyboard.press("m")
         page.click("[data-unmark]")
-        page.wait_for_selector(".od-bar-note >> text=Drag where it goes wrong")
+        page.wait_for_selector(".od-bar-note >> text=Drag to mark where it goes wrong")
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         assert marks_of(site)[1][2:] == (None, None)
 

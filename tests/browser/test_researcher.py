@@ -54,7 +54,7 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site):
         page.locator("tr", has_text="Ann").first.locator("[data-do]").click()
         page.wait_for_selector(".od-nobody >> text=Everybody is excluded from training.", timeout=20_000)
         to_tab(page, "Watch")
-        page.wait_for_selector(".od-nobody:visible >> text=goes on practising with the last predictor")
+        page.wait_for_selector(".od-nobody:visible >> text=continues with its last predictor")
         assert site.trainer.store.ratings.count_for_training(run) == 0
         to_tab(page, "Data")
         for name in ("Ann", "Bob <i>"):
@@ -243,4 +243,4 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site):
         assert bottom["y"] + bottom["height"] <= DESKTOP["height"]
         page.keyboard.press("?")
         help = page.locator(".od-help:visible")
-        assert "the left one is nearer" in help.inner_text() and "mark" not in help.inner_text()
+        assert "the left one is closer" in help.inner_text() and "mark" not in help.inner_text()

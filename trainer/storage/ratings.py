@@ -200,11 +200,15 @@ class Ratings:
         return bool(rows) and rows[0][0] != "undo"
 
     def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
-        """The rating or skip that a rater gave last in a run, of those that hold; None if there is none."""
+        """The rating or skip that a rater gave last in a run, of those that hold; None if there is none.
+
+        Only of clips that can be shown again: those of an import have no picture.
+        """
         rows = self._database.rows(
             "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
             " JOIN clips c ON c.id = e.clip_id"
-            " WHERE e.rater_id = ?1 AND c.run = ?2 AND e.kind IN ('rate', 'skip') AND NOT EXISTS ("
+            " WHERE e.rater_id = ?1 AND c.run = ?2 AND c.state = 'ready' AND e.kind IN ('rate', 'skip')"
+            " AND NOT EXISTS ("
             "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
             "  AND l.repeat = e.repeat AND l.id > e.id) ORDER BY e.id DESC LIMIT 1",
             (rater_id, run),
@@ -335,9 +339,10 @@ class Ratings:
             names = ("id", "clip_id", "value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
             db.execute(
                 f"INSERT INTO events (rater_id, kind, {', '.join(names)}, mark_from, mark_to)"
-                f" SELECT :rater_id, 'rate', :{', :'.join(names)}, ROUND(:mark_start / r.step_seconds),"
-                " ROUND(:mark_end / r.step_seconds)"
-                " FROM clips c JOIN runs r ON r.id = c.run WHERE c.id = :clip_id",
+                f" SELECT :rater_id, 'rate', :{', :'.join(names)}, first, MIN(steps, MAX(first + 1, after))"
+                " FROM (SELECT c.steps, MIN(c.steps - 1, ROUND(:mark_start / r.step_seconds)) AS first,"
+                " ROUND(:mark_end / r.step_seconds) AS after"
+                " FROM clips c JOIN runs r ON r.id = c.run WHERE c.id = :clip_id)",
                 {**row, "rater_id": rater_id},
             )
 

@@ -15,8 +15,11 @@ class Runs:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def add(self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str) -> None:
-        """Records a new run.
+    def add(
+        self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str,
+        step_seconds: float = 0.008,
+    ) -> None:  # fmt: skip
+        """Records a new run; ``step_seconds`` is the length of its robot's control step.
 
         Raises:
             UserError: If a run of that name exists.
@@ -24,9 +27,10 @@ class Runs:
         with self._database.transaction() as db:
             try:
                 db.execute(
-                    "INSERT INTO runs (id, demo, demo_sha256, seed, config, version, created_at)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    (run, demo, demo_sha256, seed, config, version, now()),
+                    "INSERT INTO runs"
+                    " (id, demo, demo_sha256, seed, config, version, created_at, step_seconds)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    (run, demo, demo_sha256, seed, config, version, now(), step_seconds),
                 )
             except sqlite3.IntegrityError:
                 raise UserError(f"run {run!r} exists already; choose another name") from None

@@ -206,7 +206,7 @@ STEPS: dict[int, str] = {
             SELECT 1 FROM comparisons l
             WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id AND l.id > c.id
         );
-    -- Who came in, and took or changed what.
+    -- Who signed in, and took or changed what.
     CREATE TABLE audit (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         at TEXT NOT NULL,
@@ -229,10 +229,14 @@ STEPS: dict[int, str] = {
         CHECK ((mark_from IS NULL) = (mark_to IS NULL))
         CHECK (mark_from IS NULL OR (kind = 'rate' AND mark_from < mark_to));
     DROP TRIGGER events_keep_update;
-    UPDATE events SET mark_from = MIN(steps - 1, CAST(ROUND(mark_start / 0.008) AS INTEGER)),
-                      mark_to = MIN(steps, MAX(MIN(steps - 1, CAST(ROUND(mark_start / 0.008) AS INTEGER)) + 1,
-                                               CAST(ROUND(mark_end / 0.008) AS INTEGER)))
-        FROM clips WHERE clips.id = events.clip_id AND mark_start IS NOT NULL;
+    UPDATE events SET mark_from = first, mark_to = MIN(steps, MAX(first + 1, after)) FROM (
+        SELECT id AS event, steps,  -- rounded as in Python, halves to the even number
+               MIN(steps - 1, CAST(ROUND(f) AS INTEGER)
+                   - (f % 2 = 0 AND f - CAST(f AS INTEGER) = 0.5)) AS first,
+               CAST(ROUND(t) AS INTEGER) - (t % 2 = 0 AND t - CAST(t AS INTEGER) = 0.5) AS after
+        FROM (SELECT e.id, c.steps, e.mark_start / 0.008 AS f, e.mark_end / 0.008 AS t
+              FROM events e JOIN clips c ON c.id = e.clip_id WHERE e.mark_start IS NOT NULL)
+    ) WHERE events.id = event;
     CREATE TRIGGER events_keep_update BEFORE UPDATE ON events
         BEGIN SELECT RAISE(ABORT, 'rating events are append-only'); END;
     CREATE INDEX events_by_rater ON events (rater_id, id);
@@ -275,7 +279,7 @@ def check_version(connection: sqlite3.Connection) -> int:
         )
     if 0 < version < min(STEPS):
         raise ValueError(
-            f"written before onedemo 0.1.0 (schema version {version}, the first release has {min(STEPS)}); "
+            f"written before onedemo 0.1.0 (schema version {version}, this one reads {min(STEPS)} to {max(STEPS)}); "
             "open it with the onedemo that wrote it, or choose another --data-dir"
         )
     return version

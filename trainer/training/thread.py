@@ -102,8 +102,9 @@ class Trainer:
             timeout_s: How long to wait for that; afterwards the thread may still be working.
         """
         self._stop.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
-            self._thread.join(timeout_s)
+        thread = self._thread
+        if thread is not None and thread is not threading.current_thread():
+            thread.join(timeout_s)
 
     def release(self) -> None:
         """Lets others have the run as soon as no thread works on it any more; after ``stop``."""
@@ -144,11 +145,16 @@ class Trainer:
             self._phase = "starting"
         # Each thread has an event of its own: one that has not ended yet is not told to go on.
         self._stop, before = threading.Event(), self._thread
-        self._thread = threading.Thread(
+        thread = threading.Thread(
             target=self._run_thread, args=(self._stop, before), name="trainer", daemon=True
         )
         self._working += 1
-        self._thread.start()
+        try:
+            thread.start()
+        except BaseException:
+            self._working -= 1
+            raise
+        self._thread = thread
 
     def _run_thread(self, stop: threading.Event, before: threading.Thread | None) -> None:
         try:

@@ -398,3 +398,42 @@ def test_repeats_come_however_many_others_rate(store, clock):
     desk = make_desk(store, clock, "bo", Assignment(), rng=Always("repeated"))
     desk.refill()
     assert desk.current == ids[0]
+
+
+def test_what_has_no_picture_is_not_taken_back(desk, store, clock):
+    """Clips of an import are rated, and cannot be shown."""
+    clock.now += 1
+    assert desk.rate(1, 4) and desk.undoable == 1
+    store.clips.set_state([1], "withdrawn")
+    assert desk.undoable is None and not desk.undo(1)
+    assert [row[1] for row in store.ratings.stream()] == [1]
+
+
+def test_why_the_last_clip_was_skipped_may_be_said_while_nothing_waits(store, clock):
+    add_clips(store, 1)
+    desk = make_desk(store, clock)
+    desk.refill()
+    clock.now += 1
+    assert desk.skip(1) and desk.current is None
+    desk.refill()
+    assert desk.skipped == 1 and desk.explain(1, "too dark")
+    assert [row[5] for row in store.ratings.stream_skips()] == ["too dark"]
+
+
+def test_a_skip_that_was_taken_back_elsewhere_is_not_explained(store, clock):
+    add_clips(store, 1)
+    first, second = make_desk(store, clock), make_desk(store, clock)
+    first.refill()
+    clock.now += 1
+    assert first.skip(1) and second.undo(1)
+    assert not first.explain(1, "too dark")
+    clock.now += 1
+    assert second.rate(1, 4)
+
+
+def test_an_answer_counts_where_no_next_clip_can_be_looked_for(desk, store, clock, monkeypatch):
+    clock.now += 1
+    with monkeypatch.context() as patch:
+        patch.setattr(store.clips, "waiting", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError()))
+        assert desk.rate(1, 4) and desk.current is None
+    assert desk.refill() and desk.current == 2

@@ -110,6 +110,30 @@ def test_what_was_said_is_read_and_said_on(old, version):
         assert sum(store.ratings.by_class("hop-1")) == 4
 
 
+def test_marks_between_steps_are_rounded_as_they_were_read(tmp_path):
+    file = tmp_path / FILE_NAME
+    shutil.copy(STORED / "v5.sqlite3", file)
+    seconds = [(0.1, 0.2), (0.108, 0.116), (1 / 60, 0.3), (0.3, 0.5)]
+    with closing(sqlite3.connect(file)) as db, db:
+        for number, (start, end) in enumerate(seconds, start=100):
+            db.execute(
+                "INSERT INTO clips (id, run, demo_step, steps, stage, iteration, snapshot, created_at)"
+                " VALUES (?, 'hop-1', 5, 37, 'online', 1, 1, '')",
+                (number,),
+            )
+            db.execute(
+                "INSERT INTO events (clip_id, rater_id, kind, value, mark_start, mark_end, snapshot,"
+                " latency_ms, created_at) VALUES (?, 2, 'rate', 2, ?, ?, 1, 900, '')",
+                (number, start, end),
+            )
+    with closing(Store(tmp_path)) as store:
+        for (start, end), rating in zip(
+            seconds, (r for r in store.ratings.for_training("hop-1") if r.clip >= 100), strict=True
+        ):
+            first = min(36, round(start / 0.008))
+            assert rating.mark == (first, min(37, max(first + 1, round(end / 0.008))))
+
+
 def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_path):
     file = tmp_path / FILE_NAME
     shutil.copy(STORED / "v5.sqlite3", file)
@@ -177,7 +201,7 @@ def laws(path):
 @pytest.mark.parametrize(
     ("number", "said"),
     [
-        (1, "was written before onedemo 0.1.0 .schema version 1, the first release has 5.; open it with"),
+        (1, "was written before onedemo 0.1.0 .schema version 1, this one reads 5 to 6.; open it with"),
         (4, "was written before onedemo 0.1.0 .schema version 4, "),
         (max(STEPS) + 1, "was written by a newer onedemo .*; update onedemo to open it"),
     ],
