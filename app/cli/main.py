@@ -20,7 +20,17 @@ from cyclopts import (
 from onedemo.core.process import prepare_process
 from onedemo.errors import UserError
 
-_APP_ONLY = ("aiohttp", "jinja2", "krippendorff", "markupsafe", "mjviser", "packaging", "pyarrow", "viser")
+_APP_ONLY = (
+    "aiohttp",
+    "jinja2",
+    "krippendorff",
+    "markupsafe",
+    "mjviser",
+    "packaging",
+    "pyarrow",
+    "rich",
+    "viser",
+)
 """Packages of the extra ``app``: the library does without, the page and the data set do not."""
 
 

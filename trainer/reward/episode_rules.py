@@ -4,7 +4,7 @@ All of them follow the current reward model. The reward of a step is the predict
 state *after* it to the demo there, times the demo steps that the phase moved on: ``r = s(c', x') (c' - c)``.
 Its sum is the similarity integrated over the demo, however long the robot takes. The state after the step is
 scored because that is what the action brought about. Each of the following can be switched off
-(``RolloutConfig.practice``); without them all, the rules are the paper's.
+(``RunConfig.practice``); without them all, the rules are the paper's.
 
 - **Adaptive phase.** After each control step the demo moves on by 0 to 3 steps, to where it looks most
   like the robot, within a set time of the episode's own. With a fixed phase a robot that is a tenth of a

@@ -279,8 +279,8 @@ def check_version(connection: sqlite3.Connection) -> int:
         )
     if 0 < version < min(STEPS):
         raise ValueError(
-            f"written before onedemo 0.1.0 (schema version {version}, this one reads {min(STEPS)} to {max(STEPS)}); "
-            "open it with the onedemo that wrote it, or choose another --data-dir"
+            f"written before onedemo 0.1.0 (schema version {version}, this one reads {min(STEPS)} to "
+            f"{max(STEPS)}); open it with the onedemo that wrote it, or choose another --data-dir"
         )
     return version
 

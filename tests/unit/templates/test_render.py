@@ -10,6 +10,7 @@ from onedemo.app.templates import render
 from onedemo.app.templates.render import environment
 
 FILES = sorted(file.name for file in (ROOT / "app" / "templates").glob("*.html"))
+assert len(FILES) > 8
 HOSTILE = "<img src=x onerror=alert(1)> & \"'"
 ESCAPED = "&lt;img src=x onerror=alert(1)&gt; &amp; &#34;&#39;"
 
