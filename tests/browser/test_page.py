@@ -66,7 +66,8 @@ def press_and_wait(page, site, act: Callable[[], Any]) -> tuple:
     before = len(site.events())
     clip = page.locator(".od-clip .od-player").get_attribute("data-clip")
     act()
-    event = until(lambda: site.events()[before:])[0]
+    # Waiting by the page lets a test's own routes be served meanwhile, which a sleeping thread would not.
+    event = until(lambda: page.wait_for_timeout(20) or site.events()[before:])[0]
     page.wait_for_function(
         "clip => document.querySelector('.od-clip .od-player')?.dataset.clip !== clip",
         arg=clip,
