@@ -110,50 +110,52 @@ def test_what_was_said_is_read_and_said_on(old, version):
         assert sum(store.ratings.by_class("hop-1")) == 4
 
 
-def test_marks_between_steps_are_rounded_as_they_were_read(tmp_path):
-    file = tmp_path / FILE_NAME
-    shutil.copy(STORED / "v5.sqlite3", file)
-    seconds = [(0.1, 0.2), (0.108, 0.116), (1 / 60, 0.3), (0.3, 0.5)]
-    with closing(sqlite3.connect(file)) as db, db:
+def put_marks(directory, steps, seconds):
+    """A database of schema 5 with marks in seconds, on clips of so many steps from number 100 on."""
+    shutil.copy(STORED / "v5.sqlite3", directory / FILE_NAME)
+    with closing(sqlite3.connect(directory / FILE_NAME)) as db, db:
         for number, (start, end) in enumerate(seconds, start=100):
             db.execute(
                 "INSERT INTO clips (id, run, demo_step, steps, stage, iteration, snapshot, created_at)"
-                " VALUES (?, 'hop-1', 5, 37, 'online', 1, 1, '')",
-                (number,),
+                " VALUES (?, 'hop-1', 5, ?, 'online', 1, 1, '')",
+                (number, steps),
             )
             db.execute(
                 "INSERT INTO events (clip_id, rater_id, kind, value, mark_start, mark_end, snapshot,"
                 " latency_ms, created_at) VALUES (?, 2, 'rate', 2, ?, ?, 1, 900, '')",
                 (number, start, end),
             )
+
+
+def marks_of(store):
+    return [rating.mark for rating in store.ratings.for_training("hop-1") if rating.clip >= 100]
+
+
+def test_marks_between_steps_are_rounded_as_they_were_read(tmp_path):
+    put_marks(tmp_path, 37, [(0.1, 0.2), (0.108, 0.116), (1 / 60, 0.3), (0.3, 0.5)])
     with closing(Store(tmp_path)) as store:
-        for (start, end), rating in zip(
-            seconds, (r for r in store.ratings.for_training("hop-1") if r.clip >= 100), strict=True
-        ):
-            first = min(36, round(start / 0.008))
-            assert rating.mark == (first, min(37, max(first + 1, round(end / 0.008))))
+        assert marks_of(store) == [(12, 25), (14, 15), (2, 37), (36, 37)]  # halves to even, within the clip
+
+
+def test_marks_of_an_export_are_kept_within_their_clip(tmp_path):
+    put_marks(tmp_path, 37, [(0.1, 0.2)])
+    names = ("value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
+    row = dict(zip(names, (2, 1, 1, None, 900, ""), strict=True))
+    with closing(Store(tmp_path)) as store:
+        for number, (start, end) in enumerate([(0.3, 0.333), (0.08, 0.08), (0.08, 0.16)], start=900):
+            mark = {"id": number, "clip_id": 100, "mark_start": start, "mark_end": end}
+            store.ratings.restore(row | mark, 2)
+        kept = store.database.rows("SELECT mark_from, mark_to FROM events WHERE id >= 900 ORDER BY id")
+    assert kept == [(36, 37), (10, 11), (10, 20)]
 
 
 def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_path):
-    file = tmp_path / FILE_NAME
-    shutil.copy(STORED / "v5.sqlite3", file)
     marks = [(first, after) for first in range(0, 40, 3) for after in range(first + 1, 42, 4)]
-    with closing(sqlite3.connect(file)) as db, db:
-        for number, (first, after) in enumerate(marks, start=100):
-            db.execute(
-                "INSERT INTO clips (id, run, demo_step, steps, stage, iteration, snapshot, created_at)"
-                " VALUES (?, 'hop-1', 5, 41, 'online', 1, 1, '')",
-                (number,),
-            )
-            db.execute(
-                "INSERT INTO events (clip_id, rater_id, kind, value, mark_start, mark_end, snapshot,"
-                " latency_ms, created_at) VALUES (?, 2, 'rate', 2, ?, ?, 1, 900, '')",
-                (number, round(first * 0.008, 6), round(after * 0.008, 6)),
-            )
+    expected = [(round(first * 0.008, 6), round(after * 0.008, 6)) for first, after in marks]
+    put_marks(tmp_path, 41, expected)
     with closing(Store(tmp_path)) as store:
-        assert [r.mark for r in store.ratings.for_training("hop-1") if r.clip >= 100] == marks
-        seconds = [(row[15], row[16]) for row in store.ratings.stream() if row[1] >= 100]
-        assert seconds == [(round(first * 0.008, 6), round(after * 0.008, 6)) for first, after in marks]
+        assert marks_of(store) == marks
+        assert [(row[15], row[16]) for row in store.ratings.stream() if row[1] >= 100] == expected
         with pytest.raises(sqlite3.IntegrityError, match="append-only"):
             store.database.rows("UPDATE events SET mark_from = 0")
 
