@@ -20,7 +20,7 @@ from onedemo.types import Rater
 log = logging.getLogger("onedemo.page")
 
 
-class PairDesk:
+class ComparisonSession:
     """One rater before pairs.
 
     Args:
@@ -69,7 +69,7 @@ class PairDesk:
             False if the press counts for nothing.
 
         Raises:
-            AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
+            AnsweredElsewhere: If the same person has answered it at another page; the page has moved on.
             sqlite3.Error: If it could not be committed; the pair stays.
         """
         with self._lock:

@@ -2,7 +2,7 @@
 
 Every press names the clip that was on screen. A press that names another clip, or comes sooner
 after the clip than anybody can judge (a held key), changes nothing. A rating is committed with its mark
-before the desk moves on; if the commit fails the clip stays. What may be taken back, the events tell.
+before the page moves on; if the commit fails the clip stays. What may be taken back, the events tell.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class AnsweredElsewhere(Exception):
     """What was pressed at a page is answered already, by the same person at another page."""
 
 
-class Desk:
+class RatingSession:
     """One rater at one page.
 
     Args:
@@ -134,7 +134,7 @@ class Desk:
             False if the press counts for nothing.
 
         Raises:
-            AnsweredElsewhere: If the same person has answered it at another page; the desk has moved on.
+            AnsweredElsewhere: If the same person has answered it at another page; the page has moved on.
             ValueError: If the mark is no stretch of the clip.
             sqlite3.Error: If it could not be committed; the clip stays.
         """

@@ -60,7 +60,7 @@ _MOST_SESSIONS = 8
 """Sessions of one browser that are looked at."""
 
 
-class Door:
+class AccessControl:
     """Recognises who asks and lets nobody through to what is not theirs.
 
     Args:

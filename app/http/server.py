@@ -21,7 +21,7 @@ from aiohttp import web
 from onedemo.app.annotation.presses import PageGone, Press, read_press
 from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.http import assets
-from onedemo.app.http.auth import RATER, SECURITY_HEADERS, Door, Route
+from onedemo.app.http.auth import RATER, SECURITY_HEADERS, AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.commands import Actions
 from onedemo.app.http.exports import Downloads
@@ -94,7 +94,7 @@ class Front:
         self._files = Files(page)
         self._downloads = Downloads(store, SECURITY_HEADERS)
         self._uploads = Uploads(store.path.parent)
-        self._door = Door(store, listening, lambda: self._port)
+        self._access = AccessControl(store, listening, lambda: self._port)
         self._proxy = Proxy(page, store)
         self._html = assets.page_html()
         self._loop = asyncio.new_event_loop()
@@ -110,8 +110,8 @@ class Front:
         """All there is, each with the least role that it asks for."""
         files, downloads = self._files, self._downloads
         return (
-            Route("GET", "/login", "stranger", self._door.log_in),
-            Route("POST", "/login", "stranger", self._door.press_button),
+            Route("GET", "/login", "stranger", self._access.log_in),
+            Route("POST", "/login", "stranger", self._access.press_button),
             Route("GET", "/healthz", "stranger", self._health),
             *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
             Route("GET", "/", "annotator", self._home),
@@ -177,7 +177,7 @@ class Front:
             ready.set()
 
     async def _serve(self, ready: threading.Event) -> None:
-        application = self._door.application(self.routes())
+        application = self._access.application(self.routes())
         runner = web.AppRunner(application, access_log=None, shutdown_timeout=2)
         await runner.setup()
         await self._proxy.open()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from onedemo.app.annotation import presses
-from onedemo.app.annotation.comparison_session import PairDesk
+from onedemo.app.annotation.comparison_session import ComparisonSession
 from onedemo.app.templates import render
 from onedemo.app.ui.context import TabContext
 from onedemo.app.ui.session import Pressing
@@ -26,7 +26,7 @@ class Compare(Pressing):
     def __init__(self, context: TabContext) -> None:
         super().__init__(context.client)
         self._context = context
-        self._desk = PairDesk(
+        self._comparing = ComparisonSession(
             context.store, context.run, context.rater, context.pair_assignment, context.client.client_id,
             guard_seconds=context.guard_seconds,
         )  # fmt: skip
@@ -53,36 +53,36 @@ class Compare(Pressing):
             if self._shown:
                 self._message = status.message
                 self._context.training.want_pairs()
-                self._desk.refill()
+                self._comparing.refill()
                 self._draw()
 
     def close(self) -> None:
         """Frees the pairs for others."""
-        self._desk.close()
+        self._comparing.close()
 
     def _carry_out(self, press: Any) -> bool:
         if press.answer == "undo":
-            return self._desk.undo(press.pair)
-        return self._desk.answer(press.pair, press.answer)
+            return self._comparing.undo(press.pair)
+        return self._comparing.answer(press.pair, press.answer)
 
     def _draw(self) -> None:
-        context, pair, undoable = self._context, self._desk.current, self._desk.undoable
-        asking = pair is not None
+        context, pair, undoable = self._context, self._comparing.current, self._comparing.undoable
+        shown = pair is not None
         undo = {"data-undo-pair": undoable} if undoable else None
         with self._client.atomic():
             self._put(
                 self._top, render("compare.html:top", count=context.store.comparisons.count(context.run))
             )
-            if asking:
+            if shown:
                 stage = render(
                     "compare.html:pair", number=pair, source=self._address(pair),
-                    ahead=self._address(self._desk.upcoming), fps=context.demo.fps,
+                    ahead=self._address(self._comparing.upcoming), fps=context.demo.fps,
                 )  # fmt: skip
             else:
                 stage = render("compare.html:waiting", message=self._message)
             self._put(self._stage, stage)
-            self._put(self._answers, render("compare.html:answers") if asking else "")
-            self._put(self._tools, render("player.html:tools", kind="compare" if asking else "", undo=undo))
+            self._put(self._answers, render("compare.html:answers") if shown else "")
+            self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))
 
     def _address(self, pair: int | None) -> str | None:
         return f"/pairs/{pair}.jpg?v={self._context.version}" if pair is not None else None

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from onedemo.app.annotation import presses
-from onedemo.app.annotation.rating_session import Desk
+from onedemo.app.annotation.rating_session import RatingSession
 from onedemo.app.annotation.scale import ANSWERS, REASONS
 from onedemo.app.templates import render
 from onedemo.app.ui.clip_player import example_address
@@ -30,7 +30,7 @@ class Rate(Pressing):
     def __init__(self, context: TabContext) -> None:
         super().__init__(context.client)
         self._context, self._lesson = context, context.lesson
-        self._desk = Desk(
+        self._rating = RatingSession(
             context.store, context.run, context.rater, context.assignment, context.client.client_id,
             dt=context.dt, demo=context.demo, guard_seconds=context.guard_seconds,
         )  # fmt: skip
@@ -70,11 +70,11 @@ class Rate(Pressing):
 
     def close(self) -> None:
         """Frees the clips for others."""
-        self._desk.close()
+        self._rating.close()
 
     def _look(self) -> None:
         if self._lesson.over:
-            self._desk.refill()
+            self._rating.refill()
         self._draw()
 
     def _carry_out(self, press: Any) -> bool:
@@ -83,18 +83,18 @@ class Rate(Pressing):
                 counted = self._lesson.take(press.exercise, press.do)
                 if counted and self._lesson.over:
                     self._context.store.accounts.set_practised(self._context.rater.id)
-                    self._desk.refill()
+                    self._rating.refill()
                 return counted
             case _ if not self._lesson.over:
                 return False
             case presses.Rate():
-                return self._desk.rate(press.clip, press.value, press.mark)
+                return self._rating.rate(press.clip, press.value, press.mark)
             case presses.Skip():
-                return self._desk.skip(press.clip)
+                return self._rating.skip(press.clip)
             case presses.Explain():
-                return self._desk.explain(press.clip, press.reason.strip())
+                return self._rating.explain(press.clip, press.reason.strip())
             case _:
-                return self._desk.undo(press.clip)
+                return self._rating.undo(press.clip)
 
     # Drawing
 
@@ -106,31 +106,31 @@ class Rate(Pressing):
                 self._draw_lesson()
 
     def _draw_clip(self) -> None:
-        context, desk, status = self._context, self._desk, self._status
-        clip, target = desk.current, status.target_ratings
+        context, rating, status = self._context, self._rating, self._status
+        clip, target = rating.current, status.target_ratings
         count = context.store.ratings.count_for_training(context.run)  # as many as the trainer counts
-        asking = clip is not None
-        self._put(self._top, render("rate.html:top", count=count, target=target, asking=asking))
-        if asking:
+        shown = clip is not None
+        self._put(self._top, render("rate.html:top", count=count, target=target, shown=shown))
+        if shown:
             source, fps = self._address(clip), context.demo.fps
-            stage = render("rate.html:clip", number=clip, source=source, fps=fps, mark=desk.mark)
+            stage = render("rate.html:clip", number=clip, source=source, fps=fps, mark=rating.mark)
         else:
             done = 0 < target <= count
             stage = render(
                 "rate.html:waiting", done=done, message=status.message, seconds=status.next_clips_s
             )
         self._put(self._stage, stage)
-        undoable = desk.undoable
+        undoable = rating.undoable
         undo = {"data-undo-clip": undoable} if undoable else None
-        self._put(self._tools, render("player.html:tools", kind="rate" if asking else "", undo=undo))
+        self._put(self._tools, render("player.html:tools", kind="rate" if shown else "", undo=undo))
         notice = render(
-            "rate.html:notice", skipped=desk.skipped, explained=desk.explained, taken_back=desk.taken_back,
-            labels=ANSWERS, reasons=REASONS,
+            "rate.html:notice", skipped=rating.skipped, explained=rating.explained,
+            taken_back=rating.taken_back, labels=ANSWERS, reasons=REASONS,
         )  # fmt: skip
         self._put(self._notice, notice)
         # Apart, so that the clip on screen is not drawn anew for it.
-        self._put(self._ahead, render("player.html:ahead", source=self._address(desk.upcoming)))
-        self._show_answers(asking)
+        self._put(self._ahead, render("player.html:ahead", source=self._address(rating.upcoming)))
+        self._show_answers(shown)
         if clip != self._clip:
             self._clip, self._slider.value = clip, _MIDDLE
 

@@ -68,7 +68,7 @@ class Pressing:
         """Carries a press out and shows at once what follows; whether it counted.
 
         Raises:
-            AnsweredElsewhere: As ``Desk.rate``.
+            AnsweredElsewhere: As ``RatingSession.rate``.
             ValueError: If it cannot be carried out.
             sqlite3.Error: If it could not be committed; everything stays as it was.
         """

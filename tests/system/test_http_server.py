@@ -1,4 +1,4 @@
-"""The public door: nothing without a session, and what each role gets. Real sockets, no browser."""
+"""The public access: nothing without a session, and what each role gets. Real sockets, no browser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import viser
 
 from helpers.beside_playwright import run
 from onedemo.app.dataset import ratings_csv
-from onedemo.app.http.auth import Door
+from onedemo.app.http.auth import AccessControl
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front, check_port
 from onedemo.app.http.tokens import issue_link, read_secret
@@ -130,9 +130,9 @@ def test_every_route_asks_for_its_role(site, role):
 
 
 def test_a_route_without_a_role_is_for_nobody(site):
-    door = Door(site.trainer.store, Listening(), lambda: 0)
+    access = AccessControl(site.trainer.store, Listening(), lambda: 0)
     routes = [route for route in site.front.routes() if route.path == "/healthz"]
-    application = door.application(routes)
+    application = access.application(routes)
     application.router.add_get("/forgotten", routes[0].handler.__func__)
     from aiohttp.test_utils import TestClient, TestServer
 

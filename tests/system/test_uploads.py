@@ -1,4 +1,4 @@
-"""Videos over HTTP, through the real door: who may, what is refused, what stays behind."""
+"""Videos over HTTP, through the real access: who may, what is refused, what stays behind."""
 
 import asyncio
 import re
@@ -9,7 +9,7 @@ from aiohttp import web
 
 from helpers.beside_playwright import run
 from onedemo.app.http import uploads
-from onedemo.app.http.auth import Door, Route
+from onedemo.app.http.auth import AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.http.uploads import Uploads
@@ -33,17 +33,17 @@ def store(tmp_path):
 
 
 def visit(store, what, *, role="researcher", **limits):
-    """Opens a door with this one address, logs somebody in, and does ``what(session, url)``."""
+    """Opens a access with this one address, logs somebody in, and does ``what(session, url)``."""
 
     async def go():
         port = 0
-        door = Door(store, Listening(port=0), lambda: port)
+        access = AccessControl(store, Listening(port=0), lambda: port)
         taken = Uploads(store.path.parent, **limits)
         routes = [
-            Route("GET", "/login", "stranger", door.log_in),
+            Route("GET", "/login", "stranger", access.log_in),
             Route("POST", "/demos", "researcher", taken.add),
         ]
-        runner = web.AppRunner(door.application(routes), shutdown_timeout=1)
+        runner = web.AppRunner(access.application(routes), shutdown_timeout=1)
         await runner.setup()
         await web.TCPSite(runner, "127.0.0.1", 0).start()
         port = runner.addresses[0][1]

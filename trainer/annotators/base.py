@@ -47,7 +47,7 @@ class Budget:
             raise RatingBudgetSpent(f"the budget of {self.budget} ratings is spent")
 
 
-class Judge(Budget):
+class DistanceAnnotator(Budget):
     """Rates by the mean distance of a clip. A subclass measures it.
 
     The k-th rating depends on the clip, the seed and k alone, so a run that was stopped goes on as if

@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from onedemo.annotators.base import Judge, RatingBudgetSpent
+from onedemo.annotators.base import DistanceAnnotator, RatingBudgetSpent
 from onedemo.annotators.custom import OwnRater
 from onedemo.annotators.noise import Errors, parse_errors
 from onedemo.annotators.scripted import Script, load_marks, table_path
@@ -52,7 +52,7 @@ class SimulatedRater(Protocol):
         ...
 
 
-class Oracle(Judge):
+class Oracle(DistanceAnnotator):
     """Rates by the mean distance between the robot's states and the demo's hidden ones.
 
     Args:
@@ -151,14 +151,14 @@ def make_rater(
                 "use a built-in demo or a table of marks (--rater script), or rate it yourself with "
                 "`onedemo serve`"
             )
-        judge: Judge = Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
-        judge.marking = MARKS in parts
-        return judge
+        annotator: DistanceAnnotator = Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
+        annotator.marking = MARKS in parts
+        return annotator
     if kind == "script":
         marks = load_marks(Path(rest) if rest else table_path(demo.path), demo)
-        judge = Script(marks, budget=budget, given=given, seed=seed, errors=errors)
-        judge.marking = MARKS in parts
-        return judge
+        annotator = Script(marks, budget=budget, given=given, seed=seed, errors=errors)
+        annotator.marking = MARKS in parts
+        return annotator
     if kind == "oracle" or not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
         raise UserError(f"unknown rater {base!r}; choose one of: {_CHOICES}")
     if parts:
@@ -171,4 +171,4 @@ def make_rater(
 
 def marker(rater: SimulatedRater) -> Callable[[Segment, int], tuple[int, int] | None] | None:
     """How a rater says where a clip goes wrong; None if it does not."""
-    return rater.mark if isinstance(rater, Judge) and rater.marking else None
+    return rater.mark if isinstance(rater, DistanceAnnotator) and rater.marking else None

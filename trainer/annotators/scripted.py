@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from onedemo.annotators.base import Judge
+from onedemo.annotators.base import DistanceAnnotator
 from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
 from onedemo.sim import vector_env
@@ -39,7 +39,7 @@ _SPIN_LIMIT = 10.0  # rad/s; faster is not seen to be faster
 _SPIN_WINDOW = 0.1  # seconds: marks made by eye are some degrees off, and a slope shows it
 
 
-class Script(Judge):
+class Script(DistanceAnnotator):
     """Rates by the mean distance between the robot and the marks in pitch, spin and airborne or not.
 
     Args:

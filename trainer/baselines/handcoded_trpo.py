@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.baselines.scores import Score, measure, save_training
 from onedemo.core.cpu import cores
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
@@ -129,7 +129,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
             if iteration % config.evaluate_every == 0 or iteration == iterations:
                 episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)
                 steps, seconds = iteration * per_iteration, time.monotonic() - started
-                score, episode = judge(config.task, episodes, steps=steps, seconds=seconds)
+                score, episode = measure(config.task, episodes, steps=steps, seconds=seconds)
                 curve.append(score)
                 if best is None or score.reward_mean > best[0].reward_mean:
                     best = score, policy.to_dict(), episode

@@ -32,7 +32,7 @@ from onedemo.baselines.preference_reward import (
     fit_reward,
     most_disputed,
 )
-from onedemo.baselines.scores import Score, judge, save_training
+from onedemo.baselines.scores import Score, measure, save_training
 from onedemo.baselines.synthetic_comparer import Comparer, agreement
 from onedemo.config import split_ratings
 from onedemo.core.cpu import cores
@@ -182,7 +182,9 @@ def train_preferences(
                     policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon,
                     nthread=config.threads,
                 )  # fmt: skip
-                score, episode = judge("backflip", episodes, steps=steps, seconds=time.monotonic() - started)
+                score, episode = measure(
+                    "backflip", episodes, steps=steps, seconds=time.monotonic() - started
+                )
                 curve.append(
                     PreferencesScore(
                         **asdict(score),

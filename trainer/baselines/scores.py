@@ -41,7 +41,7 @@ class Score:
     """Mean time until the stock Hopper-v5 would have fallen."""
 
 
-def judge(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple[Score, HiddenStates]:
+def measure(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple[Score, HiddenStates]:
     """The score of an evaluation, and its episode of the highest reward.
 
     Args:

@@ -13,7 +13,7 @@ import numpy as np
 from onedemo.queries.settings import CHOICES
 from onedemo.types import Rollouts
 
-Judge = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+Predict = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(lanes, starts, demo_steps), (n,) each, to predicted ratings and the disagreement on them, (n,) each."""
 
 _CANDIDATES = 3000
@@ -45,7 +45,7 @@ def choose(
     *,
     any_time: bool = False,
     how: str = "mix",
-    judge: Judge | None = None,
+    predict: Predict | None = None,
 ) -> list[Question]:
     """Chooses clips to be rated.
 
@@ -62,7 +62,7 @@ def choose(
         rng: Decides.
         any_time: Pair a clip with any moment of the demo instead of the moment of its own clock.
         how: One of ``CHOICES``.
-        judge: What the predictor says of a clip beside the demo, if there is one.
+        predict: What the predictor says of a clip beside the demo, if there is one.
 
     Returns:
         ``count`` questions, fewer if the rollouts hold fewer places to cut. No two overlap, and they
@@ -80,11 +80,11 @@ def choose(
         middle = clip_steps // 2
         demo = np.maximum(rollouts.clock[lanes, starts + middle].astype(int) - middle, 0)
     within = np.flatnonzero(demo + clip_steps <= demo_steps)
-    shares = CHOICES[how] if judge is not None else CHOICES["uniform"]
+    shares = CHOICES[how] if predict is not None else CHOICES["uniform"]
     scores: dict[str, np.ndarray] = {}
-    if judge is not None and set(shares) != {"any"}:
+    if predict is not None and set(shares) != {"any"}:
         within = within[: max(_CANDIDATES, 20 * count)]  # looking at some of them is enough
-        scores["high"], scores["disagreement"] = judge(lanes[within], starts[within], demo[within])
+        scores["high"], scores["disagreement"] = predict(lanes[within], starts[within], demo[within])
     lanes, starts, demo = lanes[within], starts[within], demo[within]
     chosen: list[int] = []
     reasons: list[str] = []

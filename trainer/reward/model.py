@@ -126,7 +126,7 @@ class Snapshot(ABC):
             return probabilities.argmax(axis=-1).astype(np.float32) + 1.0
         return expected(probabilities)
 
-    def judge(
+    def clip_ratings(
         self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predicted rating of whole clips, and how far the members disagree.

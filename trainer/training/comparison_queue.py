@@ -30,7 +30,7 @@ _NEAR = 8
 """Control steps that the clocks of a pair's clips may differ."""
 
 
-class Pairing:
+class ComparisonQueue:
     """The pairs of one run.
 
     Args:

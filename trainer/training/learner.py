@@ -162,14 +162,14 @@ class Learner:
         config = self.config.ratings
         snapshot = snapshot or self._first
 
-        def judge(
+        def predict(
             lanes: np.ndarray, starts: np.ndarray, demo_steps: np.ndarray
         ) -> tuple[np.ndarray, np.ndarray]:
             assert snapshot is not None
             span = np.arange(0, self.clip_steps, _JUDGED_EVERY)
             cut = (lanes[:, None], starts[:, None] + span)
             frames = self.frames_of(demo_steps[:, None] + span)
-            return snapshot.judge(frames, rollouts.obs[cut], rollouts.actions[cut])
+            return snapshot.clip_ratings(frames, rollouts.obs[cut], rollouts.actions[cut])
 
         return choose(
             rollouts,
@@ -179,7 +179,7 @@ class Learner:
             rng,
             any_time=config.pairing == "any" and self.iteration == 0,
             how=config.choice,
-            judge=judge if snapshot is not None else None,
+            predict=predict if snapshot is not None else None,
         )
 
     def predict(self, snapshot: Snapshot, segment: Segment, demo_step: int) -> float:

@@ -48,7 +48,7 @@ def due_in_round(number: int, rounds: int, total: int) -> int:
     return min(total, max(number, round(total * number / rounds)))
 
 
-class Asking:
+class RatingQueue:
     """The queue of one run.
 
     Args:

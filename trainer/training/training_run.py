@@ -34,9 +34,9 @@ from onedemo.storage.store import Store
 from onedemo.training.best_rollouts import Gallery
 from onedemo.training.checkpoint import load_checkpoint, save_checkpoint
 from onedemo.training.clip_worker import ClipMaker
-from onedemo.training.comparison_queue import Pairing
+from onedemo.training.comparison_queue import ComparisonQueue
 from onedemo.training.learner import Learner
-from onedemo.training.rating_queue import Asking, Simulated
+from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import Track
@@ -83,7 +83,7 @@ class TrainingRun:
         self.files = RunDirectory(data_dir, run)
         self.dt = vector_env.spec(config.env).dt
         """Seconds of a control step."""
-        self.queue = Asking(store, run, config, simulated)
+        self.queue = RatingQueue(store, run, config, simulated)
         """The clips that are put to annotators."""
         self.learner: Learner | None = None
         """None until ``open``."""
@@ -100,7 +100,7 @@ class TrainingRun:
         self._gallery = None
         if renderer is not None:
             self._gallery = Gallery(self.files.rollouts, demo, self.dt, renderer)
-        self._pairing: Pairing | None = None
+        self._comparisons: ComparisonQueue | None = None
         self._training_set = TrainingSet(store, run)
         self._fitted_event = 0
         self._pool: Rollouts | None = None
@@ -136,7 +136,7 @@ class TrainingRun:
                 self.store, file=self.files.clip, frames=frames, frames_of=learner.frames_of,
                 renderer=self._renderer,
             )  # fmt: skip
-            self._pairing = Pairing(
+            self._comparisons = ComparisonQueue(
                 self.store, self.run, self.files.pair, frames, self._renderer, self.config.seed
             )
             self.queue.clips.recover(self.run)
@@ -192,8 +192,8 @@ class TrainingRun:
     def ask(self) -> None:
         """Fills the queues of clips and pairs; simulated annotators answer at once."""
         self.queue.fill(self._opened, self._pool, self.snapshot)
-        if self._pairing is not None:
-            self._pairing.fill(self._opened, self._pool)
+        if self._comparisons is not None:
+            self._comparisons.fill(self._opened, self._pool)
 
     def refit(self, at_least: int = 1) -> bool:
         """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
@@ -251,8 +251,8 @@ class TrainingRun:
 
     def want_pairs(self) -> None:
         """Somebody would compare pairs: some are made while this is said every few seconds."""
-        if self._pairing is not None:
-            self._pairing.want()
+        if self._comparisons is not None:
+            self._comparisons.want()
 
     def rollout_file(self, iteration: int, suffix: str) -> Path:
         """The best rollout of an iteration, as ``Gallery.file``.

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment, to_repeat, to_share
-from onedemo.app.annotation.rating_session import AnsweredElsewhere, Desk
+from onedemo.app.annotation.rating_session import AnsweredElsewhere, RatingSession
 from onedemo.config import RatingsConfig, RunConfig
 from onedemo.storage.clips import NewClip
 from onedemo.storage.ratings import Answered
 from onedemo.storage.store import Store
-from onedemo.training.rating_queue import Asking
+from onedemo.training.rating_queue import RatingQueue
 from onedemo.types import Demo, Segment
 
 
@@ -108,71 +108,71 @@ def clock():
 def make_desk(store, clock, name="bo", assignment=None, **more):
     assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
     rater = store.accounts.ensure(name, "annotator")
-    return Desk(store, "r", rater, assignment, name, dt=0.01, demo=DEMO, clock=clock, **more)
+    return RatingSession(store, "r", rater, assignment, name, dt=0.01, demo=DEMO, clock=clock, **more)
 
 
 @pytest.fixture
-def desk(store, clock):
-    desk = make_desk(store, clock)
+def session(store, clock):
+    session = make_desk(store, clock)
     add_clips(store, 3)
-    desk.refill()
-    return desk
+    session.refill()
+    return session
 
 
-def test_rating_is_in_the_database_before_the_next_clip(desk, store, clock):
-    assert (desk.current, desk.upcoming) == (1, 2)
+def test_rating_is_in_the_database_before_the_next_clip(session, store, clock):
+    assert (session.current, session.upcoming) == (1, 2)
     clock.now += 1.5
-    assert desk.rate(1, 4)
-    assert (desk.current, desk.upcoming) == (2, 3)
+    assert session.rate(1, 4)
+    assert (session.current, session.upcoming) == (2, 3)
     assert [(row[1], row[5], row[9]) for row in store.ratings.stream()] == [(1, 4, 1500)]
 
 
-def test_press_for_another_clip_or_too_soon_counts_for_nothing(desk, store, clock):
-    assert not desk.rate(1, 4)  # No 0.3 s since it came.
+def test_press_for_another_clip_or_too_soon_counts_for_nothing(session, store, clock):
+    assert not session.rate(1, 4)  # No 0.3 s since it came.
     clock.now += 0.31
-    assert not desk.rate(2, 4)  # Not the one on screen.
-    assert desk.rate(1, 4)
-    assert not desk.rate(1, 4)
-    assert not desk.rate(2, 4)  # The held key's next repeat.
+    assert not session.rate(2, 4)  # Not the one on screen.
+    assert session.rate(1, 4)
+    assert not session.rate(1, 4)
+    assert not session.rate(2, 4)  # The held key's next repeat.
     assert store.ratings.by_class() == [0, 0, 0, 1, 0]
 
 
-def test_undo_brings_clips_back_one_by_one(desk, store, clock):
+def test_undo_brings_clips_back_one_by_one(session, store, clock):
     for clip in (1, 2):
         clock.now += 1
-        desk.rate(clip, 5)
-    assert not desk.undo(1)  # not the last one
-    assert desk.undoable == 2 and desk.undo(2)
-    assert (desk.current, desk.upcoming) == (2, 3)
-    assert not desk.undo(2)  # sent twice
-    assert desk.undo(1)
-    assert desk.current == 1
-    assert desk.undoable is None and not desk.undo(1)
+        session.rate(clip, 5)
+    assert not session.undo(1)  # not the last one
+    assert session.undoable == 2 and session.undo(2)
+    assert (session.current, session.upcoming) == (2, 3)
+    assert not session.undo(2)  # sent twice
+    assert session.undo(1)
+    assert session.current == 1
+    assert session.undoable is None and not session.undo(1)
     clock.now += 1
-    assert desk.rate(1, 2)
-    assert (desk.current, desk.upcoming) == (2, 3)
+    assert session.rate(1, 2)
+    assert (session.current, session.upcoming) == (2, 3)
     assert store.ratings.by_class() == [0, 1, 0, 0, 0]
 
 
-def test_skip_moves_on_without_a_rating(desk, store, clock):
+def test_skip_moves_on_without_a_rating(session, store, clock):
     clock.now += 1
-    assert desk.skip(1)
-    assert desk.current == 2
+    assert session.skip(1)
+    assert session.current == 2
     assert store.ratings.by_class() == [0] * 5
-    assert desk.undo(1)
-    assert desk.current == 1 and desk.taken_back.value is None
+    assert session.undo(1)
+    assert session.current == 1 and session.taken_back.value is None
 
 
 def test_how_soon_a_press_may_come_is_a_setting(store, clock):
-    desk = make_desk(store, clock, guard_seconds=0.05)
+    session = make_desk(store, clock, guard_seconds=0.05)
     add_clips(store, 2)
-    desk.refill()
-    assert not desk.rate(1, 4)
+    session.refill()
+    assert not session.rate(1, 4)
     clock.now += 0.06
-    assert desk.rate(1, 4)
+    assert session.rate(1, 4)
 
 
-def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatch):
+def test_clip_stays_if_the_rating_cannot_be_saved(session, store, clock, monkeypatch):
     def fail(*_, **__):
         raise sqlite3.OperationalError("disk is full")
 
@@ -180,61 +180,61 @@ def test_clip_stays_if_the_rating_cannot_be_saved(desk, store, clock, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(store.ratings, "rate", fail)
         with pytest.raises(sqlite3.OperationalError):
-            desk.rate(1, 3)
-    assert desk.current == 1
-    assert desk.rate(1, 3)
+            session.rate(1, 3)
+    assert session.current == 1
+    assert session.rate(1, 3)
 
 
 def test_waiting_desk_takes_clips_when_they_come(store, clock):
-    desk = make_desk(store, clock)
-    assert not desk.refill()
-    assert desk.current is None
+    session = make_desk(store, clock)
+    assert not session.refill()
+    assert session.current is None
     first, second = add_clips(store, 2)
-    assert desk.refill()
-    assert (desk.current, desk.upcoming) == (first, second)
+    assert session.refill()
+    assert (session.current, session.upcoming) == (first, second)
 
 
 def test_two_raters_never_see_the_same_clip(store, clock):
     assignment = Assignment(again=Again(shared=0, repeated=0))
-    desks = [make_desk(store, clock, name, assignment) for name in ("bo", "cy")]
+    sessions = [make_desk(store, clock, name, assignment) for name in ("bo", "cy")]
     add_clips(store, 6)
     seen = []
     for _ in range(3):
-        for desk in desks:
-            desk.refill()
+        for session in sessions:
+            session.refill()
             clock.now += 1
-            seen.append(desk.current)
-            desk.rate(desk.current, 1)
+            seen.append(session.current)
+            session.rate(session.current, 1)
     assert sorted(seen) == sorted(set(seen))
-    desks[0].close()
+    sessions[0].close()
 
 
-def test_a_mark_is_of_the_clip_that_is_rated_and_comes_back_when_it_is_taken_back(desk, store, clock):
+def test_a_mark_is_of_the_clip_that_is_rated_and_comes_back_when_it_is_taken_back(session, store, clock):
     clock.now += 1
     for mark in ((2, 1), (2, 9), (-1, 2)):
         with pytest.raises(ValueError, match="3 pictures"):
-            desk.rate(1, 2, mark)
-    assert desk.current == 1
-    assert desk.rate(1, 2, (0, 2)) and desk.mark is None
+            session.rate(1, 2, mark)
+    assert session.current == 1
+    assert session.rate(1, 2, (0, 2)) and session.mark is None
     clock.now += 1
-    assert desk.rate(2, 3)
+    assert session.rate(2, 3)
     assert [row[15:17] for row in store.ratings.stream()] == [(0.0, 0.016), (None, None)]
-    assert desk.undo(2) and desk.mark is None
-    assert desk.undo(1) and desk.mark == (0, 2)
+    assert session.undo(2) and session.mark is None
+    assert session.undo(1) and session.mark == (0, 2)
 
 
-def test_the_reason_for_a_skip_may_be_said_until_the_next_press(desk, store, clock):
+def test_the_reason_for_a_skip_may_be_said_until_the_next_press(session, store, clock):
     clock.now += 1
-    desk.skip(1)
-    assert not desk.skip(2) and desk.skipped == 1  # too soon
-    assert not desk.explain(2, "dark") and desk.explain(1, "dark") and not desk.explain(1, "again")
-    assert desk.explained
+    session.skip(1)
+    assert not session.skip(2) and session.skipped == 1  # too soon
+    assert not session.explain(2, "dark") and session.explain(1, "dark") and not session.explain(1, "again")
+    assert session.explained
     clock.now += 1
-    desk.skip(2)
-    assert not desk.explained
+    session.skip(2)
+    assert not session.explained
     clock.now += 1
-    desk.rate(3, 3)
-    assert not desk.explain(2, "too late")
+    session.rate(3, 3)
+    assert not session.explain(2, "too late")
     assert store.database.rows("SELECT clip_id, reason FROM events WHERE kind = 'skip' ORDER BY id") == [
         (1, None), (1, "dark"), (2, None),
     ]  # fmt: skip
@@ -293,21 +293,21 @@ def test_a_shared_clip_is_rated_by_the_second_person_too_and_both_count(store, c
 def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
     add_clips(store, REPEAT_AFTER + 3)
     rng = Always("fresh")
-    desk = make_desk(store, clock, assignment=Assignment(), rng=rng)
-    desk.refill()
+    session = make_desk(store, clock, assignment=Assignment(), rng=rng)
+    session.refill()
     for _ in range(REPEAT_AFTER + 1):
         rng.kind = "repeated"  # too early, but once
         clock.now += 1
-        desk.rate(desk.current, 4)
-    assert desk.current == REPEAT_AFTER + 2 and desk.upcoming == 1
+        session.rate(session.current, 4)
+    assert session.current == REPEAT_AFTER + 2 and session.upcoming == 1
     clock.now += 1
-    desk.rate(desk.current, 4)
-    assert desk.current == 1
+    session.rate(session.current, 4)
+    assert session.current == 1
     clock.now += 1
-    assert desk.rate(1, 2)
+    assert session.rate(1, 2)
     rows = [(row[1], row[5], row[14]) for row in store.ratings.stream()]
     assert rows[0] == (1, 4, 0) and rows[-1] == (1, 2, 1)
-    assert desk.undoable == 1 and desk.undo(1) and desk.current == 1
+    assert session.undoable == 1 and session.undo(1) and session.current == 1
     assert [(row[1], row[5], row[14]) for row in store.ratings.stream()] == rows[:-1]
 
 
@@ -322,16 +322,16 @@ def test_as_many_clips_come_to_several_people_and_twice_to_one_as_are_meant_to(s
     store.database.rows("PRAGMA synchronous = OFF")
     add_clips(store, 400)
     assignment = Assignment()
-    desks = [
+    sessions = [
         make_desk(store, clock, name, assignment, rng=random.Random(seed))
         for seed, name in enumerate(("bo", "cy", "di"))
     ]
     while store.clips.waiting("r"):
-        for desk in desks:
-            desk.refill()
+        for session in sessions:
+            session.refill()
             clock.now += 1
-            if desk.current is not None:
-                assert desk.rate(desk.current, 3)
+            if session.current is not None:
+                assert session.rate(session.current, 3)
     rows = [(row[1], row[4], row[14]) for row in store.ratings.stream()]
     firsts = [(clip, rater) for clip, rater, repeat in rows if not repeat]
     repeats = [(clip, rater) for clip, rater, repeat in rows if repeat]
@@ -345,7 +345,7 @@ def test_clips_that_nobody_rated_in_time_are_taken_back(store):
     ids = add_clips(store, 3)  # all of iteration 1
     store.ratings.rate(ids[0], store.accounts.ensure("bo", "annotator").id, 4, 900)
     config = RunConfig(ratings=RatingsConfig(stale_iterations=10))
-    asking = Asking(store, "r", config, None)
+    asking = RatingQueue(store, "r", config, None)
     asking.withdraw_stale(11)
     assert [clip.id for clip in store.clips.waiting("r")] == ids[1:]
     asking.withdraw_stale(12)
@@ -395,28 +395,28 @@ def test_repeats_come_however_many_others_rate(store, clock):
         other = store.accounts.ensure(f"other {number}", "annotator").id
         for clip in ids[20:50]:
             store.ratings.rate(clip, other, 3, 900)
-    desk = make_desk(store, clock, "bo", Assignment(), rng=Always("repeated"))
-    desk.refill()
-    assert desk.current == ids[0]
+    session = make_desk(store, clock, "bo", Assignment(), rng=Always("repeated"))
+    session.refill()
+    assert session.current == ids[0]
 
 
-def test_what_has_no_picture_is_not_taken_back(desk, store, clock):
+def test_what_has_no_picture_is_not_taken_back(session, store, clock):
     """Clips of an import are rated, and cannot be shown."""
     clock.now += 1
-    assert desk.rate(1, 4) and desk.undoable == 1
+    assert session.rate(1, 4) and session.undoable == 1
     store.clips.set_state([1], "withdrawn")
-    assert desk.undoable is None and not desk.undo(1)
+    assert session.undoable is None and not session.undo(1)
     assert [row[1] for row in store.ratings.stream()] == [1]
 
 
 def test_why_the_last_clip_was_skipped_may_be_said_while_nothing_waits(store, clock):
     add_clips(store, 1)
-    desk = make_desk(store, clock)
-    desk.refill()
+    session = make_desk(store, clock)
+    session.refill()
     clock.now += 1
-    assert desk.skip(1) and desk.current is None
-    desk.refill()
-    assert desk.skipped == 1 and desk.explain(1, "too dark")
+    assert session.skip(1) and session.current is None
+    session.refill()
+    assert session.skipped == 1 and session.explain(1, "too dark")
     assert [row[5] for row in store.ratings.stream_skips()] == ["too dark"]
 
 
@@ -431,9 +431,9 @@ def test_a_skip_that_was_taken_back_elsewhere_is_not_explained(store, clock):
     assert second.rate(1, 4)
 
 
-def test_an_answer_counts_where_no_next_clip_can_be_looked_for(desk, store, clock, monkeypatch):
+def test_an_answer_counts_where_no_next_clip_can_be_looked_for(session, store, clock, monkeypatch):
     clock.now += 1
     with monkeypatch.context() as patch:
         patch.setattr(store.clips, "waiting", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError()))
-        assert desk.rate(1, 4) and desk.current is None
-    assert desk.refill() and desk.current == 2
+        assert session.rate(1, 4) and session.current is None
+    assert session.refill() and session.current == 2

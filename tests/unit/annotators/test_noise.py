@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from onedemo.annotators.base import Judge, RatingBudgetSpent
+from onedemo.annotators.base import DistanceAnnotator, RatingBudgetSpent
 from onedemo.annotators.noise import ERRORS, parse_errors
 from onedemo.errors import UserError
 from onedemo.types import Segment
@@ -14,7 +14,7 @@ N = 2000
 THRESHOLDS = (1.0, 2.0, 3.0, 4.0)  # classes one wide: 0.5 is the middle of class 5, 2.5 of class 3
 
 
-class Ruler(Judge):
+class Ruler(DistanceAnnotator):
     """Is told the distance at each step: it stands where x would be."""
 
     def distance(self, qpos, qvel, demo_step):

@@ -64,12 +64,14 @@ def test_a_round_is_a_mix_of_the_best_the_most_doubtful_and_any():
     """Lanes 0 to 9 are rated high, 10 to 19 doubted, of 100."""
     clock = np.tile(np.arange(400), (100, 1))
 
-    def judge(lanes, starts, demo):
+    def predict(lanes, starts, demo):
         return 5.0 * (lanes < 10) + 0.01 * starts, 1.0 * ((10 <= lanes) & (lanes < 20))
 
     shares = []
     for seed in range(5):
-        chosen = choose(rollouts(clock), 20, 38, 400, np.random.default_rng(seed), any_time=True, judge=judge)
+        chosen = choose(
+            rollouts(clock), 20, 38, 400, np.random.default_rng(seed), any_time=True, predict=predict
+        )
         assert len(chosen) == 20
         lanes = np.array([q.lane for q in chosen])
         assert (lanes[:8] < 10).all()  # 0.4 of 20 ...
@@ -82,13 +84,13 @@ def test_the_best_rated_come_first():
     clock = np.tile(np.arange(100), (30, 1))
     chosen = choose(
         rollouts(clock), 10, 38, 1000, np.random.default_rng(0), any_time=True,
-        judge=lambda lanes, starts, demo: (demo / 1000.0, np.zeros(len(lanes))),
+        predict=lambda lanes, starts, demo: (demo / 1000.0, np.zeros(len(lanes))),
     )  # fmt: skip
     best = [q.demo_step for q in chosen[:4]]
     assert best == sorted(best, reverse=True) and best[0] > 940 and best[-1] > 900
 
 
-def test_without_a_judge_nothing_is_preferred():
+def test_without_a_predictor_nothing_is_preferred():
     clock = np.tile(np.arange(400), (100, 1))
     chosen = choose(rollouts(clock), 300, 38, 400, np.random.default_rng(0), any_time=True)
     lanes = np.array([q.lane for q in chosen])
@@ -96,17 +98,17 @@ def test_without_a_judge_nothing_is_preferred():
     assert counts.min() > 40
 
 
-def test_a_judge_looks_at_some_clips_only_and_only_at_possible_ones():
+def test_a_predictor_looks_at_some_clips_only_and_only_at_possible_ones():
     looked = []
 
-    def judge(lanes, starts, demo):
+    def predict(lanes, starts, demo):
         looked.append(len(lanes))
         assert demo.min() >= 0 and (demo + 38 <= 500).all() and starts.max() <= 1000 - 38
         return np.zeros(len(lanes)), np.zeros(len(lanes))
 
     clock = np.tile(np.arange(1000), (50, 1))
     for any_time in (True, False):
-        choose(rollouts(clock), 10, 38, 500, np.random.default_rng(0), any_time=any_time, judge=judge)
+        choose(rollouts(clock), 10, 38, 500, np.random.default_rng(0), any_time=any_time, predict=predict)
     assert looked == [3000, 3000]
 
 
@@ -137,7 +139,7 @@ def loves_the_middle(lanes, starts, demo):
 def test_a_round_spreads_over_the_demo():
     clock = np.tile(np.arange(400), (60, 1))
     chosen = choose(
-        rollouts(clock), 30, 38, 600, np.random.default_rng(0), any_time=True, judge=loves_the_middle
+        rollouts(clock), 30, 38, 600, np.random.default_rng(0), any_time=True, predict=loves_the_middle
     )
     steps = np.array([q.demo_step for q in chosen])
     for i, step in enumerate(steps):
@@ -148,7 +150,7 @@ def test_a_round_spreads_over_the_demo():
 def test_where_the_demo_is_short_clips_crowd_before_they_overlap():
     clock = np.tile(np.arange(400), (16, 1))
     chosen = choose(
-        rollouts(clock), 30, 38, 45, np.random.default_rng(0), any_time=True, judge=loves_the_middle
+        rollouts(clock), 30, 38, 45, np.random.default_rng(0), any_time=True, predict=loves_the_middle
     )
     assert len(chosen) == 30
     for i, one in enumerate(chosen):
@@ -179,8 +181,8 @@ def test_no_clip_spans_the_end_of_an_episode(kind, judged):
         done = replace(done, terminated=rng.random((20, 400)) < 0.02)
     if kind == "terminated":
         done = replace(done, truncated=np.zeros((20, 400), bool))
-    judge = (lambda lanes, starts, demo: (-starts, starts)) if judged else None
-    chosen = choose(done, 400, 38, 400, np.random.default_rng(1), any_time=True, judge=judge)
+    predict = (lambda lanes, starts, demo: (-starts, starts)) if judged else None
+    chosen = choose(done, 400, 38, 400, np.random.default_rng(1), any_time=True, predict=predict)
     assert len(chosen) > 100
     for q in chosen:
         done.segment(q.lane, q.start, 38)  # raises where a cut spans an end
@@ -192,7 +194,7 @@ def test_the_same_generator_asks_the_same():
     clock = np.tile(np.arange(200), (10, 1))
     one, two, other = (
         choose(
-            rollouts(clock), 20, 38, 600, np.random.default_rng(seed), any_time=True, judge=loves_the_middle
+            rollouts(clock), 20, 38, 600, np.random.default_rng(seed), any_time=True, predict=loves_the_middle
         )
         for seed in (3, 3, 4)
     )
@@ -204,11 +206,11 @@ def test_one_reason_alone_and_each_clip_knows_why(how, score):
     clock = np.tile(np.arange(400), (100, 1))
     told = {"rating": lambda lanes: 1.0 + lanes / 25, "doubt": lambda lanes: 1.0 - lanes / 100}
 
-    def judge(lanes, starts, demo):
+    def predict(lanes, starts, demo):
         return told["rating"](lanes), told["doubt"](lanes)
 
     chosen = choose(
-        rollouts(clock), 12, 38, 400, np.random.default_rng(0), any_time=True, how=how, judge=judge
+        rollouts(clock), 12, 38, 400, np.random.default_rng(0), any_time=True, how=how, predict=predict
     )
     lanes = np.array([q.lane for q in chosen])
     assert {q.choice for q in chosen} == {how}
@@ -220,9 +222,9 @@ def test_a_mix_says_of_each_clip_which_part_it_is_and_chance_has_no_score():
     clock = np.tile(np.arange(400), (100, 1))
     chosen = choose(
         rollouts(clock), 10, 38, 400, np.random.default_rng(0), any_time=True,
-        judge=lambda lanes, starts, demo: (1.0 + lanes / 50, lanes / 100),
+        predict=lambda lanes, starts, demo: (1.0 + lanes / 50, lanes / 100),
     )  # fmt: skip
     assert [q.choice for q in chosen] == ["high"] * 4 + ["disagreement"] * 3 + ["any"] * 3
     assert all((q.score is None) == (q.choice == "any") for q in chosen)
-    plain = choose(rollouts(clock), 10, 38, 400, np.random.default_rng(0), how="uniform", judge=None)
+    plain = choose(rollouts(clock), 10, 38, 400, np.random.default_rng(0), how="uniform", predict=None)
     assert {(q.choice, q.score) for q in plain} == {("any", None)}

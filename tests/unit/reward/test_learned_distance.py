@@ -239,7 +239,7 @@ def test_frames_and_states_are_broadcast_against_each_other(fitted, rollouts, vi
 def test_judging_a_clip_is_the_mean_of_its_steps_and_the_members_quarrel(fitted):
     snapshot, _, ratings, frames = fitted
     obs, actions = (np.stack([getattr(r.segment, n) for r in ratings[:5]]) for n in ("obs", "actions"))
-    mean, doubt = snapshot.judge(frames[:5], obs, actions)
+    mean, doubt = snapshot.clip_ratings(frames[:5], obs, actions)
     rated = snapshot.member_probabilities(frames[:5], obs, actions) @ np.arange(1, 6)  # (members, 5, W)
     np.testing.assert_allclose(mean, predicted(snapshot, ratings[:5], frames[:5]), atol=1e-5)
     np.testing.assert_allclose(doubt, rated.mean(axis=-1).std(axis=0), atol=1e-5)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from onedemo.annotators.base import Judge
+from onedemo.annotators.base import DistanceAnnotator
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.segment_marks import (
@@ -32,7 +32,7 @@ def rated(value=3, mark=None, event=1):
     )  # fmt: skip
 
 
-class Given(Judge):
+class Given(DistanceAnnotator):
     """Sees the distances it is given."""
 
     def __init__(self, distances):

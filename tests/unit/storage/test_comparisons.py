@@ -9,7 +9,7 @@ import pytest
 
 from helpers.small_world import falling_demo, falling_states, small_config
 from onedemo.app.annotation.assignment import Assignment
-from onedemo.app.annotation.comparison_session import PairDesk
+from onedemo.app.annotation.comparison_session import ComparisonSession
 from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import COMPARISONS
@@ -20,7 +20,7 @@ from onedemo.render.renderer import RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
-from onedemo.training.comparison_queue import Pairing, draw_pairs
+from onedemo.training.comparison_queue import ComparisonQueue, draw_pairs
 from onedemo.training.learner import Learner
 from onedemo.types import Segment
 from unit.queries.test_selection import rollouts
@@ -88,7 +88,7 @@ class Clock:
 def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo, cy = (
-        PairDesk(store, "r", store.accounts.ensure(name, "annotator"), assignment, name, clock=clock)
+        ComparisonSession(store, "r", store.accounts.ensure(name, "annotator"), assignment, name, clock=clock)
         for name in ("bo", "cy")
     )
     bo.refill()
@@ -114,16 +114,16 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
 def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo, cy = (store.accounts.ensure(name, "annotator") for name in ("bo", "cy"))
-    gone = PairDesk(store, "r", bo, assignment, 1, clock=clock)
+    gone = ComparisonSession(store, "r", bo, assignment, 1, clock=clock)
     gone.refill()  # and its line breaks without a word
-    back = PairDesk(store, "r", bo, assignment, 2, clock=clock)
-    other = PairDesk(store, "r", cy, assignment, 3, clock=clock)
+    back = ComparisonSession(store, "r", bo, assignment, 2, clock=clock)
+    other = ComparisonSession(store, "r", cy, assignment, 3, clock=clock)
     other.refill()
     assert (other.current, other.upcoming) == (pairs[2], pairs[3])
     back.refill()
     assert (back.current, back.upcoming) == (pairs[0], pairs[1])
     clock.now += 200
-    late = PairDesk(store, "r", store.accounts.ensure("di", "annotator"), assignment, 4, clock=clock)
+    late = ComparisonSession(store, "r", store.accounts.ensure("di", "annotator"), assignment, 4, clock=clock)
     late.refill()
     assert (late.current, late.upcoming) == (pairs[0], pairs[1])  # the leases have ended
     assert back.answer(pairs[0], "left") and back.current not in (pairs[0], pairs[1])
@@ -132,7 +132,9 @@ def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_aga
 def test_a_pair_that_was_compared_at_another_page_of_the_same_person_is_let_go(store, pairs):
     clock, assignment = Clock(), Assignment()
     bo = store.accounts.ensure("bo", "annotator")
-    laptop, phone = (PairDesk(store, "r", bo, assignment, page, clock=clock) for page in ("laptop", "phone"))
+    laptop, phone = (
+        ComparisonSession(store, "r", bo, assignment, page, clock=clock) for page in ("laptop", "phone")
+    )
     laptop.refill()
     clock.now += 121  # the lease has ended
     phone.refill()
@@ -174,12 +176,14 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
     demo = falling_demo(tmp_path / "demo")
     learner = Learner(small_config(), demo.frames, demo.fps)
     with RenderThread() as drawing:
-        pairing = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
-        pairing.fill(learner, learner.random_rollouts())
+        queue = ComparisonQueue(
+            store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0
+        )
+        queue.fill(learner, learner.random_rollouts())
         assert store.comparisons.waiting_pairs("r", "cut") == []  # nobody looks
-        pairing.want()
-        pairing.fill(learner, None)
-        pairing.fill(learner, learner.random_rollouts())
+        queue.want()
+        queue.fill(learner, None)
+        queue.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
         ready = store.comparisons.waiting_pairs("r")
         assert len(ready) == 6
@@ -194,7 +198,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         drawn = drawing.submit(lambda renderer: renderer.render(left.qpos[first])).result()[0]
         apart = [np.abs(robot[..., ::-1] - drawn.astype(int)).mean() for robot in robots]
         assert apart[0] < 2 < apart[1]  # the left one is on the left
-        pairing.fill(learner, learner.random_rollouts())
+        queue.fill(learner, learner.random_rollouts())
         assert len(store.comparisons.waiting_pairs("r")) == 6  # the queue is full
 
         # A process that died: one pair answered, one without its picture, one with a damaged one, one that
@@ -207,7 +211,9 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         RunDirectory(tmp_path, "r").pair(lost).unlink()
         new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
         undrawn = store.comparisons.add_pairs("r", [new])[0].id
-        after = Pairing(store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0)
+        after = ComparisonQueue(
+            store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0
+        )
         after.want()
         after.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()

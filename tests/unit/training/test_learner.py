@@ -225,7 +225,7 @@ def test_with_a_predictor_it_asks_about_better_clips(features, by_distance):
         mean[name] = np.mean(values)
     assert mean["judged"] > mean["blind"] + 0.4
     assert learner.predict(snapshot, first[0].segment, first[0].demo_step) == pytest.approx(
-        snapshot.judge(
+        snapshot.clip_ratings(
             learner.frames_of(first[0].demo_step + np.arange(38))[None],
             first[0].segment.obs[None],
             first[0].segment.actions[None],

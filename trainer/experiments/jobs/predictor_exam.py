@@ -110,7 +110,7 @@ class Exam:
     def _rank(self, snapshot: Snapshot, clips: _Clips) -> float | None:
         frames = self._learner.frames_of(clips.demo_steps[:, None] + np.arange(self._learner.clip_steps))
         obs, actions = (np.stack([getattr(s, name) for s in clips.segments]) for name in ("obs", "actions"))
-        return spearman(snapshot.judge(frames, obs, actions)[0], -clips.distances)
+        return spearman(snapshot.clip_ratings(frames, obs, actions)[0], -clips.distances)
 
     def _cut(self, rollouts: Rollouts, count: int) -> _Clips:
         """Clips of rollouts beside any moments of the demo."""
