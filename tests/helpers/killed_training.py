@@ -19,8 +19,6 @@ from typing import Any
 
 import torch
 
-import onedemo.reward.episode_rules
-import onedemo.training.learner
 from helpers import small_world
 from onedemo.core import files
 from onedemo.reward.model import Snapshot
@@ -29,6 +27,7 @@ from onedemo.storage.database import FILE_NAME
 from onedemo.storage.ratings import Ratings
 from onedemo.storage.runs import Runs
 from onedemo.storage.store import Store
+from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo
 
@@ -60,7 +59,7 @@ def arm(moment: str) -> None:
         "runs": Runs,
         "snapshot": Snapshot,
         "os": files.os,
-        "learner": onedemo.training.learner.Learner,
+        "learner": Learner,
     }[owner]
     whole, calls = getattr(where, name), 0
 
@@ -79,7 +78,6 @@ def arm(moment: str) -> None:
 
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
-    onedemo.training.learner._WILD_LANES, onedemo.reward.episode_rules._BUFFER_TRIES = 4, 200
     config = small_world.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))

@@ -100,6 +100,8 @@ def small_config(**overrides):
         "rollouts.threads": 1,
         "predictor.updates": 60,
         "predictor.visual_dims": 8,
+        "practice.random_lanes": 8,
+        "practice.bank_tries": 500,
     }
     return load_config(None, small | {key.replace("__", "."): value for key, value in overrides.items()})
 

@@ -96,9 +96,7 @@ def small_disk(tmp_path):
         (no_right, "may not be written to"),
     ],
 )
-def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
-    tmp_path, monkeypatch, request, fault, words
-):
+def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(tmp_path, request, fault, words):
     if fault is full:
         request.getfixturevalue("small_disk")
     if fault is no_right:
@@ -107,12 +105,11 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
         for place in (tmp_path, *tmp_path.parents):  # it may be read, as before
             with suppress(OSError):
                 place.chmod(place.stat().st_mode | 0o055)
-    monkeypatch.setattr("onedemo.training.thread._REST_S", (0.5, 1.0))
     demo = falling_demo(tmp_path / "demo")
     config = small_config(rollouts__total_steps=10**6, ratings__online=200)
     with closing(Store(tmp_path / "data")) as store:
         ann = store.accounts.ensure("Ann", "annotator")
-        trainer = make_trainer(store, demo, config=config)
+        trainer = make_trainer(store, demo, config=config, rest_s=(0.5, 1.0))
         trainer.start()
         try:
             wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1, 60)
@@ -133,7 +130,6 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(
 
 def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
     """The page does not flicker between "starting", "online" and "failed" with every try."""
-    monkeypatch.setattr("onedemo.training.thread._REST_S", (0.1, 0.1))
     tries = []
 
     def break_down(self, snapshot):
@@ -145,7 +141,7 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
     config = small_config(rollouts__total_steps=10**6, ratings__online=200)
     with closing(Store(tmp_path / "data")) as store:
         ann = store.accounts.ensure("Ann", "annotator")
-        trainer = make_trainer(store, demo, config=config)
+        trainer = make_trainer(store, demo, config=config, rest_s=(0.1, 0.1))
         trainer.start()
         try:
             wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1, 60)

@@ -43,10 +43,8 @@ _GRACE = 10
 """Control steps before an episode may end early."""
 _BUFFER_EVERY = 20
 """Control steps of the demo between entries of the reset buffer."""
-_BUFFER_TRIES = 8000
-"""Random states compared with each of them."""
 _BUFFER_KEPT = 12
-"""Of these, the ones most like it are kept."""
+"""For each of them so many states are kept, the ones most like it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,6 +67,8 @@ def fill_reset_buffer(
     frames_of: Callable[[np.ndarray], np.ndarray],
     demo_steps: int,
     rng: np.random.Generator,
+    *,
+    tries: int,
 ) -> ResetBuffer:
     """Picks, for moments all over the demo, the states that the predictor rates best there.
 
@@ -78,12 +78,13 @@ def fill_reset_buffer(
         frames_of: Demo frame at control steps.
         demo_steps: Control steps of the demo.
         rng: Draws the states that are tried.
+        tries: How many at each moment.
     """
     flat = {name: getattr(states, name).reshape(-1, getattr(states, name).shape[-1]) for name in _STATE}
     moments = np.arange(0, max(1, demo_steps - 2 * _BUFFER_EVERY), _BUFFER_EVERY)
     kept, ratings = [], []
     for moment in moments:
-        tried = rng.integers(len(flat["obs"]), size=_BUFFER_TRIES)
+        tried = rng.integers(len(flat["obs"]), size=tries)
         frame = frames_of(np.full(1, moment))
         liked = snapshot.ratings(frame, flat["obs"][tried], flat["actions"][tried])
         best = np.argsort(-liked, kind="stable")[:_BUFFER_KEPT]

@@ -72,8 +72,13 @@ class PracticeConfig:
     give_up: float = 0.3
     """An episode ends when the running similarity falls below this share of that of the reset
     buffer's states, the most that the predictor gives; 0: never."""
+    random_lanes: int = 64
+    """Lanes of random states: the first clips and the reset buffer are picked from what happens there."""
+    bank_tries: int = 8000
+    """Random states that are compared with each moment of the demo to fill the reset buffer."""
 
     def __post_init__(self) -> None:
+        at_least("practice", self, random_lanes=1, bank_tries=1)
         if not 0 <= self.bank_share <= 1:
             raise ValueError(f"practice.bank_share must be in 0..1, got {self.bank_share}")
         if not 0 <= self.give_up < 1:

@@ -65,7 +65,7 @@ def mean_kl(
 
 
 def fisher_product(
-    policy: Policy, inputs_Bf: torch.Tensor, damping: float
+    policy: Policy, inputs_Bf: torch.Tensor, damping: float, *, chunk: int = 2048
 ) -> Callable[[torch.Tensor], torch.Tensor]:
     """The function v -> (F + damping I) v, F the mean Fisher matrix of the policy at the inputs.
 
@@ -79,13 +79,14 @@ def fisher_product(
         policy: Not changed; its parameters at the time of the call count.
         inputs_Bf: Normalised inputs, (B, f).
         damping: Added to the diagonal.
+        chunk: Samples at a time: what lies between two layers then stays in a core's cache.
     """
     layers = [layer for layer in policy.mean if isinstance(layer, nn.Linear)]
     shapes = [shape for layer in layers for shape in (layer.weight.shape, layer.bias.shape)]
     sizes = [shape.numel() for shape in shapes]
     weights = [layer.weight.detach().clone() for layer in layers]
     precision_a = torch.exp(-2 * policy.log_std.detach()) / len(inputs_Bf)
-    passes = [_passes(policy.mean, weights, precision_a, inputs) for inputs in inputs_Bf.split(_CHUNK)]
+    passes = [_passes(policy.mean, weights, precision_a, inputs) for inputs in inputs_Bf.split(chunk)]
 
     def product(v_P: torch.Tensor) -> torch.Tensor:
         parts = v_P.split([*sizes, len(precision_a)])
@@ -97,10 +98,6 @@ def fisher_product(
         return out_P
 
     return product
-
-
-_CHUNK = 2048
-"""Samples at a time: what lies between two layers then stays in a core's cache."""
 
 
 def _passes(

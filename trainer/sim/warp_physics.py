@@ -56,14 +56,16 @@ class WarpPhysics:
         frame_skip: Physics steps in a control step.
         num_envs: Lanes.
         device: Warp's name of a device, as "cuda:0"; the first GPU, else the processor, if None.
+        room: Contacts and constraint rows that a lane can hold; the most that this robot can have if None.
 
     Raises:
         UserError: If there is no such device, or MuJoCo Warp cannot simulate the model.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, frame_skip: int, num_envs: int, device: str | None = None
-    ) -> None:
+        self, model: mujoco.MjModel, frame_skip: int, num_envs: int, device: str | None = None,
+        *, room: tuple[int, int] | None = None,
+    ) -> None:  # fmt: skip
         self.device = _device(device)
         self._duration = frame_skip * model.opt.timestep
         self._motors = model.nq + model.nv
@@ -73,7 +75,7 @@ class WarpPhysics:
             except NotImplementedError as error:
                 raise UserError(f"the warp physics cannot simulate this robot: {error}") from None
             self._model.opt.warn_overflow = False  # step() raises instead
-            self._room = _room(model, self._model.nxn_geom_pair_filtered.numpy())
+            self._room = room or _room(model, self._model.nxn_geom_pair_filtered.numpy())
             contacts, rows = self._room
             self._data = mujoco_warp.make_data(model, nworld=num_envs, nconmax=contacts, njmax=rows)
             # One copy each way per control step; from page-locked memory, where there is a GPU.

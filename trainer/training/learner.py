@@ -31,7 +31,6 @@ from onedemo.types import Rollouts, Segment
 from onedemo.vision.pose_estimator import Track
 
 _RANDOM_LANES = 16
-_WILD_LANES = 64
 _WILD_SECONDS = 0.96
 """How long random states run on before the next."""
 _AHEAD_SECONDS = (0.0, 0.13, 0.33)
@@ -249,7 +248,9 @@ class Learner:
         if snapshot.number != self._buffer_of and (practice.bank_share or practice.give_up):
             rng = np.random.default_rng([self.config.seed, snapshot.number])
             wild = self._wild_rollouts()
-            self._buffer = fill_reset_buffer(snapshot, wild, self.frames_of, self.demo_steps, rng)
+            self._buffer = fill_reset_buffer(
+                snapshot, wild, self.frames_of, self.demo_steps, rng, tries=practice.bank_tries
+            )
             self._buffer_of = snapshot.number
         self._rules.use(snapshot, self._buffer)
 
@@ -269,8 +270,8 @@ class Learner:
         if self._wild is None:
             config, every = self.config, round(_WILD_SECONDS / self.dt)
             self._wild = wild_rollouts(
-                config.env, lanes=_WILD_LANES, steps=8 * every, every=every, seed=config.seed + 1,
-                nthread=config.rollouts.threads,
+                config.env, lanes=config.practice.random_lanes, steps=8 * every, every=every,
+                seed=config.seed + 1, nthread=config.rollouts.threads,
             )  # fmt: skip
             self._wild = _anywhere(self._wild, self.demo_steps - every, config.seed)
         return self._wild

@@ -23,8 +23,6 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
-_REST_S = (5.0, 300.0)
-"""Before the first try after a failure, and at most: each rest is twice as long as the one before."""
 _MESSAGES = {
     "pretrain": "So far the robot moves at random. It starts training once it has {} ratings.",
     "online": "The robot is practising with what it learned from your ratings.",
@@ -48,9 +46,17 @@ class Trainer:
         training: What is worked on; the thread alone changes it.
         held: What nobody else may have while the run is worked on, its lock above all. It is closed by
             whoever is last: ``release``, or the thread, if it still works then.
+        rest_s: Seconds before the first try after a failure, and at most: each rest is twice as long as the
+            one before.
     """
 
-    def __init__(self, training: TrainingRun, held: ExitStack | None = None) -> None:
+    def __init__(
+        self,
+        training: TrainingRun,
+        held: ExitStack | None = None,
+        *,
+        rest_s: tuple[float, float] = (5.0, 300.0),
+    ) -> None:
         self._training = training
         self.store, self.run, self.demo = training.store, training.run, training.demo
         self.config, self.data_dir, self.dt = training.config, training.data_dir, training.dt
@@ -65,7 +71,8 @@ class Trainer:
         self._working = 0  # threads that have not ended: more than one after a stop that timed out
         self._released = self._retired = False
         self._stop, self._pause, self._retry = (threading.Event() for _ in range(3))
-        self._rest_s = _REST_S[0]
+        self._first_rest_s, self._longest_rest_s = rest_s
+        self._rest_s = self._first_rest_s
         self._work_began = self._work_s = 0.0
         self._phase, self._error = "starting", ""
         self._next_phase = ""  # of a try after a failure, shown once it has gone well
@@ -219,7 +226,8 @@ class Trainer:
         """Shows a failure and keeps cutting clips, until it is time or somebody says to try again."""
         self._error = in_words(error)
         self._tell("failed")
-        until, self._rest_s = time.monotonic() + self._rest_s, min(2 * self._rest_s, _REST_S[1])
+        until = time.monotonic() + self._rest_s
+        self._rest_s = min(2 * self._rest_s, self._longest_rest_s)
         self._retry.clear()
         while not (stop.is_set() or self._retry.wait(_TICK_S) or time.monotonic() > until):
             try:
@@ -229,7 +237,7 @@ class Trainer:
                 log.debug("run %s: still failing", self.run, exc_info=True)
 
     def _went_well(self) -> None:
-        self._rest_s = _REST_S[0]
+        self._rest_s = self._first_rest_s
         if self._error:
             self._error, self._phase = "", self._next_phase
 

@@ -39,7 +39,7 @@ from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
-from onedemo.vision.pose_estimator import Track
+from onedemo.vision.pose_estimator import PoseEstimator, Track
 from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 
@@ -61,6 +61,7 @@ class TrainingRun:
         watch: Called after each iteration.
         start: Snapshot of another run that this one's predictor starts from; a copy is kept, so a resumed
             run needs none.
+        learn_robot: Learns what the robot looks like, as ``onedemo.vision.pose_estimator.learn``.
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class TrainingRun:
         cache_dir: Path | None = None,
         watch: Callable[[Learner, Snapshot], None] | None = None,
         start: Path | None = None,
+        learn_robot: Callable[..., PoseEstimator] = learn_pose_estimator,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
@@ -95,7 +97,7 @@ class TrainingRun:
         """Control steps per second in the last iteration."""
         self.preparing = "Looking at the video for the first time."
         """What ``look`` does, one sentence."""
-        self._encoder, self._renderer = encoder, renderer
+        self._encoder, self._renderer, self._learn_robot = encoder, renderer, learn_robot
         self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
         self._gallery = None
         if renderer is not None:
@@ -157,7 +159,7 @@ class TrainingRun:
         if not self.config.predictor.appearance:
             return features, None
         self.preparing = "Looking at pictures of the robot: about a minute, the first time only."
-        look = learn_pose_estimator(self.config.env, self._encoder, self._cache_dir / "robots", check)
+        look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", check)
         return features, look.track(features, self.demo.fps) if look.knows(features) else None
 
     def see(self, features: np.ndarray, track: Track | None) -> None:

@@ -28,12 +28,10 @@ from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics, vector_env
 from onedemo.vision.encoders import Encoder
 
-PICTURES = 4000
 _SEED = 20_000
 _STANDING = 0.25
 """Share of the pictures in which the robot began upright: random states hardly ever are."""
 _MEMBERS = 3
-_EPOCHS = 25
 _BATCH = 64
 _RATE = 2e-3
 _DROPPED = 0.2
@@ -110,7 +108,7 @@ def _go_on() -> None:
 
 def learn(
     env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on, *,
-    count: int | None = None,
+    count: int = 4000, epochs: int = 25,
 ) -> PoseEstimator:  # fmt: skip
     """Learns what the robot looks like, or takes what was learned before.
 
@@ -119,7 +117,8 @@ def learn(
         encoder: Looks at the pictures.
         cache_dir: Where it is kept, by robot and encoder.
         check: Called every now and then; what it raises ends the learning.
-        count: Pictures to learn from, where it is not known yet; ``PICTURES`` if None.
+        count: Pictures to learn from, where it is not known yet.
+        epochs: Passes over them.
 
     Raises:
         UserError: If this machine cannot draw.
@@ -130,7 +129,7 @@ def learn(
     if (data := read_whole(path)) is not None:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return PoseEstimator(stored)
-    appearance = regress(*pictures(env_name, encoder, count or PICTURES, check), check)
+    appearance = regress(*pictures(env_name, encoder, count, check), check, epochs=epochs)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **appearance.tensors)
     write_atomic(path, buffer.getvalue())
@@ -166,7 +165,9 @@ def pictures(
     return features, kinematics.pose(qpos[:, 1:]).astype(np.float32)
 
 
-def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on) -> PoseEstimator:
+def regress(
+    features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on, *, epochs: int = 25
+) -> PoseEstimator:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
 
     One thread computes: several would add up in another order, and runs with another number of
@@ -176,28 +177,31 @@ def regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None] =
         features: (n, D).
         poses: (n, P).
         check: Called before each pass over the pictures; what it raises ends the fit.
+        epochs: Passes over the pictures.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _regress(features, poses, check)
+        return _regress(features, poses, check, epochs)
     finally:
         torch.set_num_threads(threads)
 
 
-def _regress(features: np.ndarray, poses: np.ndarray, check: Callable[[], None]) -> PoseEstimator:
+def _regress(
+    features: np.ndarray, poses: np.ndarray, check: Callable[[], None], epochs: int
+) -> PoseEstimator:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
     inputs, targets = torch.from_numpy((features - mean) / std), torch.from_numpy(poses)
     train = len(inputs) * 9 // 10
     tensors = {"mean": mean, "std": std, "held_out": np.zeros(poses.shape[1])}
-    updates = _EPOCHS * -(-train // _BATCH)
+    updates = epochs * -(-train // _BATCH)
     for member in range(_MEMBERS):
         net = _network(features.shape[1])
         _draw_weights(net, generator)
         optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-2, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
-        for _ in range(_EPOCHS):
+        for _ in range(epochs):
             check()
             for index in torch.randperm(train, generator=generator).split(_BATCH):
                 seen = inputs[index]

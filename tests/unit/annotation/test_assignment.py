@@ -105,10 +105,12 @@ def clock():
     return Clock()
 
 
-def make_desk(store, clock, name="bo", assignment=None, **more):
+def make_desk(store, clock, name="bo", assignment=None, holder=None, **more):
     assignment = assignment or Assignment(again=Again(shared=0, repeated=0))
     rater = store.accounts.ensure(name, "annotator")
-    return RatingSession(store, "r", rater, assignment, name, dt=0.01, demo=DEMO, clock=clock, **more)
+    return RatingSession(
+        store, "r", rater, assignment, holder or name, dt=0.01, demo=DEMO, clock=clock, **more
+    )
 
 
 @pytest.fixture
@@ -370,8 +372,7 @@ def test_while_nothing_fresh_waits_nothing_is_asked_again(store, clock):
 def test_a_clip_that_was_rated_at_another_page_of_the_same_person_is_let_go(store, clock):
     add_clips(store, 6)
     assignment = Assignment(again=Again(shared=0, repeated=0))
-    first, second = (make_desk(store, clock, "bo", assignment) for _ in range(2))
-    second._holder = "phone"
+    first, second = (make_desk(store, clock, "bo", assignment, holder) for holder in ("desk", "phone"))
     first.refill()
     clock.now += 121  # the lease has ended
     second.refill()

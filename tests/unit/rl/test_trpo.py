@@ -113,13 +113,12 @@ def test_fisher_product_is_the_dense_fisher_matrix():
     torch.testing.assert_close(columns, fisher + 0.1 * torch.eye(count + 2, dtype=torch.float64))
 
 
-def test_fisher_product_does_not_depend_on_how_the_samples_are_cut(monkeypatch):
+def test_fisher_product_does_not_depend_on_how_the_samples_are_cut():
     policy = small_policy().double()
     inputs = torch.randn(40, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     vector = torch.arange(parameters(policy).numel(), dtype=torch.float64)
     whole = fisher_product(policy, inputs, damping=0.1)(vector)
-    monkeypatch.setattr("onedemo.rl.fisher._CHUNK", 7)
-    torch.testing.assert_close(fisher_product(policy, inputs, damping=0.1)(vector), whole)
+    torch.testing.assert_close(fisher_product(policy, inputs, damping=0.1, chunk=7)(vector), whole)
 
 
 def paid(rollouts, rewards):

@@ -194,16 +194,15 @@ def test_a_run_can_be_set_to_it():
 
 
 @pytest.mark.parametrize("room", [(1, 41), (14, 12)])
-def test_contacts_without_room_are_an_error(room, monkeypatch):
+def test_contacts_without_room_are_an_error(room):
     from onedemo.sim import warp_physics
 
     lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
     model = load_model(vector_env.SPECS["hopper"].xml)
     states = np.concatenate([np.zeros((4, 1)), lying, np.zeros((4, 6))], axis=1)
     warp_physics.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
-    monkeypatch.setattr(warp_physics, "_room", lambda model, pairs: room)
     with pytest.raises(RuntimeError, match=f"room for, {room[0]} a lane with {room[1]} constraints"):
-        warp_physics.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
+        warp_physics.WarpPhysics(model, 4, 4, room=room).step(states, np.zeros((4, 3)))
 
 
 def test_an_unknown_device_names_those_there_are():

@@ -17,16 +17,14 @@ def features():
 
 
 @pytest.fixture(autouse=True)
-def few_random_states(monkeypatch):
-    """A run draws 61,440 of them, which takes a while."""
-    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 1000)
+def one_thread():
     torch.set_num_threads(1)  # as a run does
 
 
 def onedemo(**overrides):
     """The method's own settings, in small; episodes end early and start in the reset buffer."""
-    return small_config(**{"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3} | overrides)
+    own = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3, "practice__bank_tries": 1000}
+    return small_config(**own | overrides)
 
 
 CONFIGS = {"paper": small_config, "onedemo": onedemo}

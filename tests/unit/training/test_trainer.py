@@ -1,4 +1,5 @@
 import ast
+import functools
 import os
 import re
 import subprocess
@@ -27,6 +28,7 @@ from onedemo.training.runs import add_run, find_run
 from onedemo.training.simulated_run import train
 from onedemo.training.thread import Trainer
 from onedemo.training.training_run import TrainingRun
+from onedemo.vision.pose_estimator import learn as learn_robot
 from onedemo.vision.pose_estimator import regress
 
 
@@ -61,8 +63,8 @@ def work(training, iterations=10**6):
     training.ask()
 
 
-def make_trainer(store, demo, **options):
-    return Trainer(make_run(store, demo, **options))
+def make_trainer(store, demo, *, rest_s=(5.0, 300.0), **options):
+    return Trainer(make_run(store, demo, **options), rest_s=rest_s)
 
 
 def by_rule(segment, demo_step):
@@ -279,15 +281,8 @@ def test_after_a_stop_that_timed_out_one_thread_follows_the_other(store, demo, m
     assert freed == [0]
 
 
-@pytest.fixture
-def few_wild(monkeypatch):
-    """Random states are drawn and tried in seconds."""
-    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 4)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 200)
-
-
 @pytest.mark.slow
-def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monkeypatch, few_wild):
+def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo):
     ann = store.accounts.ensure("Ann", "annotator")
     looked = threading.Event()
 
@@ -299,8 +294,8 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
             rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
         )
 
-    monkeypatch.setattr("onedemo.training.training_run.learn_pose_estimator", look)
-    trainer_ = make_trainer(store, demo, config=small_config(method="onedemo", ratings__pretrain=30))
+    config = small_config(method="onedemo", ratings__pretrain=30)
+    trainer_ = make_trainer(store, demo, config=config, learn_robot=look)
     trainer_.start()
     for _ in range(3):
         wait_for(lambda: store.clips.waiting("r", "cut"))
@@ -317,7 +312,7 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo, monk
 
 
 @pytest.mark.slow
-def test_the_live_robot_follows_policy_and_snapshot(store, demo, few_wild):
+def test_the_live_robot_follows_policy_and_snapshot(store, demo):
     ann = store.accounts.ensure("Ann", "annotator")
     config = small_config(
         method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
@@ -393,13 +388,14 @@ def test_every_rating_asked_for_can_be_given(store, demo):
 
 def test_a_run_of_before_there_were_methods_goes_on(store, demo):
     """Its config names no method, its snapshots hold one network, its checkpoint no rules."""
-    first = make_run(store, demo, Simulated(name="rule", rate=by_rule))
+    config = small_config(practice__random_lanes=64, practice__bank_tries=8000)  # as they all were
+    first = make_run(store, demo, Simulated(name="rule", rate=by_rule), config)
     work(first, iterations=3)
     before = store.runs.iterations("r")
     as_of_before(first.files.path)
     found = find_run(store, store.path.parent, demo, name="r", wanted=None)
-    assert found is not None and found[1] == small_config()
-    second = make_run(store, demo, Simulated(name="rule", rate=by_rule))
+    assert found is not None and found[1] == config
+    second = make_run(store, demo, Simulated(name="rule", rate=by_rule), config)
     assert Trainer(second).status().method == "paper"
     work(second)
     after = store.runs.iterations("r")
@@ -504,6 +500,10 @@ class Mixed(Thumbnail):
         return super().encode(frames) @ mixture
 
 
+learn_robot_roughly = functools.partial(learn_robot, count=80, epochs=4)
+"""From few pictures: enough to see poses by, if badly."""
+
+
 def watched_run(store, demo, config):
     """A whole run rated by a rule, during which no hidden file may be opened; its end."""
     global _watching
@@ -511,7 +511,9 @@ def watched_run(store, demo, config):
     _watching = True
     try:
         rater = Simulated(name="rule", rate=by_rule)
-        training = make_run(store, demo, rater, config=config, encoder=Mixed())
+        training = make_run(
+            store, demo, rater, config=config, encoder=Mixed(), learn_robot=learn_robot_roughly
+        )
         work(training)
     finally:
         _watching = False
@@ -558,20 +560,11 @@ def test_training_opens_no_hidden_file_and_learns_the_same_from_noise(demo, tmp_
     learns_the_same_from_noise(demo, tmp_path, small_config())
 
 
-@pytest.fixture
-def few_pictures(monkeypatch):
-    """Of the robot, and few random states: enough to see poses by, if badly."""
-    monkeypatch.setattr("onedemo.vision.pose_estimator.PICTURES", 80)
-    monkeypatch.setattr("onedemo.vision.pose_estimator._EPOCHS", 4)
-    monkeypatch.setattr("onedemo.training.learner._WILD_LANES", 8)
-    monkeypatch.setattr("onedemo.reward.episode_rules._BUFFER_TRIES", 500)
-
-
 ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
 
 
 @pytest.mark.seam
-def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path, few_pictures):
+def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path):
     """PoseEstimator, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
     demo = drawn_demo(tmp_path / "demo")
     learner, snapshot = learns_the_same_from_noise(
@@ -582,7 +575,7 @@ def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path, f
 
 
 @pytest.mark.seam
-def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_path, few_pictures):
+def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_path):
     """What the robot looks like and the bank are made again, the running similarity is kept."""
     demo = drawn_demo(tmp_path / "demo")
     rater = Simulated(name="rule", rate=by_rule)
@@ -590,11 +583,12 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
     for name, threads in (("whole", 1), ("stopped", 1), ("two", 2)):
         settings = {"ratings__online": 0, "rollouts__total_steps": 1600, "rollouts__threads": threads}
         config = small_config(**ONEDEMO, **settings)
+        options = {"config": config, "encoder": Mixed(), "learn_robot": learn_robot_roughly}
         store = Store(tmp_path / name)
         if name == "stopped":
-            work(make_run(store, demo, rater, config=config, encoder=Mixed()), iterations=2)
+            work(make_run(store, demo, rater, **options), iterations=2)
             assert len(store.runs.iterations("r")) == 2
-        work(make_run(store, demo, rater, config=config, encoder=Mixed()))
+        work(make_run(store, demo, rater, **options))
         rows = store.runs.iterations("r")
         curves.append([(row["predicted"], row["kl"], row["true_reward"]) for row in rows])
         store.close()

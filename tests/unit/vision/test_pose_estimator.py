@@ -1,5 +1,6 @@
 """Learning what the robot looks like, on real pictures where they matter."""
 
+import functools
 import logging
 
 import numpy as np
@@ -40,31 +41,28 @@ def poses():
     return kinematics.pose(obs).astype(np.float32)
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    monkeypatch.setattr(pose_estimator, "_EPOCHS", 10)
-    monkeypatch.setattr(pose_estimator, "PICTURES", 60)
+quick_regress = functools.partial(regress, epochs=10)
 
 
 @pytest.mark.slow
-def test_the_regression_finds_the_pose_and_says_how_well(poses, quick):
-    learned = regress(seen(poses), poses)
+def test_the_regression_finds_the_pose_and_says_how_well(poses):
+    learned = quick_regress(seen(poses), poses)
     held_out = seen(poses[540:]), poses[540:]
     error = np.square(learned.poses(held_out[0]) - held_out[1]).mean(axis=0)
     np.testing.assert_allclose(learned.held_out, 1 - error / held_out[1].var(axis=0), atol=1e-4)
     assert learned.held_out.shape == (kinematics.POSE,) and learned.held_out.mean() > 0.85
     # Of features that have nothing to do with the pose it says so.
-    assert regress(np.random.default_rng(2).permutation(seen(poses)), poses).held_out.max() < 0.2
+    assert quick_regress(np.random.default_rng(2).permutation(seen(poses)), poses).held_out.max() < 0.2
 
 
 @pytest.mark.slow
-def test_the_same_pictures_give_the_same_networks_on_any_number_of_threads(poses, quick):
-    one = regress(seen(poses), poses)
+def test_the_same_pictures_give_the_same_networks_on_any_number_of_threads(poses):
+    one = quick_regress(seen(poses), poses)
     torch.set_num_threads(2)
     torch.manual_seed(5)
     expected = torch.rand(2)
     torch.manual_seed(5)
-    two = regress(seen(poses), poses)
+    two = quick_regress(seen(poses), poses)
     assert torch.get_num_threads() == 2 and torch.equal(torch.rand(2), expected)  # neither is touched
     torch.set_num_threads(1)
     assert one.tensors.keys() == two.tensors.keys()
@@ -72,15 +70,15 @@ def test_the_same_pictures_give_the_same_networks_on_any_number_of_threads(poses
         np.testing.assert_array_equal(tensor, two.tensors[name], err_msg=name)
 
 
-def test_it_is_made_again_from_its_tensors(poses, quick):
-    one = regress(seen(poses), poses)
+def test_it_is_made_again_from_its_tensors(poses):
+    one = quick_regress(seen(poses), poses)
     two = PoseEstimator(one.tensors)
     np.testing.assert_array_equal(one.poses(seen(poses)), two.poses(seen(poses)))
     np.testing.assert_array_equal(one.held_out, two.held_out)
 
 
-def test_strangeness_is_about_one_for_what_it_learned_from(poses, quick):
-    learned = regress(seen(poses), poses)
+def test_strangeness_is_about_one_for_what_it_learned_from(poses):
+    learned = quick_regress(seen(poses), poses)
     assert learned.strangeness(seen(poses)) == pytest.approx(1, abs=0.01) and learned.knows(seen(poses))
     assert learned.strangeness(10 * seen(poses)) > 50 and not learned.knows(10 * seen(poses))
 
@@ -139,12 +137,9 @@ def efficientnet():
 
 
 @pytest.fixture(scope="module")
-def learned(efficientnet, tmp_path_factory):
+def learned(efficientnet, looked):
     """From 300 pictures of the real renderer; a run takes 4,000."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pose_estimator, "PICTURES", 300)
-        patch.setattr(pose_estimator, "_EPOCHS", 15)
-        return learn("hopper", efficientnet, tmp_path_factory.mktemp("robots"))
+    return learn("hopper", efficientnet, looked / "robots")
 
 
 @pytest.mark.seam
@@ -202,9 +197,12 @@ class OtherEncoder(Thumbnail):
     name = "other"
 
 
+quick_learn = functools.partial(learn, count=60, epochs=10)
+
+
 @pytest.mark.seam
-def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, monkeypatch, caplog):
-    first = learn("hopper", Thumbnail(), tmp_path)
+def test_what_was_learned_is_kept_and_made_anew_when_damaged(tmp_path, monkeypatch, caplog):
+    first = quick_learn("hopper", Thumbnail(), tmp_path)
     (file,) = tmp_path.iterdir()
 
     def nothing_is_drawn(*args):
@@ -212,11 +210,11 @@ def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, mo
 
     with monkeypatch.context() as patch:
         patch.setattr(pose_estimator, "pictures", nothing_is_drawn)
-        again = learn("hopper", Thumbnail(), tmp_path)
+        again = quick_learn("hopper", Thumbnail(), tmp_path)
         with pytest.raises(AssertionError, match="drawn again"):
-            learn("hopper", Thumbnail(), tmp_path / "elsewhere")
+            quick_learn("hopper", Thumbnail(), tmp_path / "elsewhere")
         with pytest.raises(AssertionError, match="drawn again"):
-            learn("hopper", OtherEncoder(), tmp_path)
+            quick_learn("hopper", OtherEncoder(), tmp_path)
     features = np.random.default_rng(0).uniform(0, 255, (5, 64)).astype(np.float32)
     np.testing.assert_array_equal(again.poses(features), first.poses(features))
     np.testing.assert_array_equal(again.held_out, first.held_out)
@@ -227,7 +225,7 @@ def test_what_was_learned_is_kept_and_made_anew_when_damaged(quick, tmp_path, mo
         file.write_bytes(damaged)
         caplog.clear()
         with caplog.at_level(logging.WARNING):
-            anew = learn("hopper", Thumbnail(), tmp_path)
+            anew = quick_learn("hopper", Thumbnail(), tmp_path)
         assert "is damaged" in caplog.text
         np.testing.assert_array_equal(anew.poses(features), first.poses(features))
         assert file.read_bytes() == whole

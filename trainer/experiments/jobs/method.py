@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +76,16 @@ def method_job(
 
 def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
     """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
-    text = to_toml(run_config({"ratings": 350, "set": {}, **settings}, 0))
-    return {"config": hashlib.sha256(text.encode()).hexdigest()[:10]}
+    config = asdict(run_config({"ratings": 350, "set": {}, **settings}, 0))
+    for section, added in _ADDED.items():
+        for name, default in added.items():
+            if config[section][name] == default:
+                del config[section][name]
+    return {"config": hashlib.sha256(to_toml(config).encode()).hexdigest()[:10]}
+
+
+_ADDED = {"practice": {"random_lanes": 64, "bank_tries": 8000}}
+"""Settings that were constants when runs were reported: those runs, which had these values, stay theirs."""
 
 
 def run(

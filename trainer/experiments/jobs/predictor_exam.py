@@ -95,7 +95,10 @@ class Exam:
             )
 
         rng = np.random.default_rng([_STREAM, self._seed, 1])  # the same tries for all predictors
-        buffer = fill_reset_buffer(snapshot, self._wild, frames_of, self._learner.demo_steps, rng)
+        tries = self._learner.config.practice.bank_tries
+        buffer = fill_reset_buffer(
+            snapshot, self._wild, frames_of, self._learner.demo_steps, rng, tries=tries
+        )
         picked = [
             self._oracle.distance(qpos[None], qvel[None], int(step))[0]
             for qpos, qvel, step in zip(buffer.qpos, buffer.qvel, buffer.clock, strict=True)
