@@ -83,7 +83,7 @@ def rate_five_and_look(chromium, serving, tmp_path, *options):
         expected = [rate(page, data_dir, value, how) for value, how in ways]
     assert rows(data_dir) == expected
     until(lambda: health(links["annotator"])["phase"] == "online", 60)
-    with opened(chromium, links["researcher"], SMALL, accept_downloads=True) as page:
+    with opened(chromium, links["researcher"], SMALL) as page:
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
         page.wait_for_timeout(2000)
         where = page.locator("canvas[data-engine]").bounding_box()

@@ -92,7 +92,7 @@ def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_pa
 
 def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, tmp_path):
     ids = rate_some(site)
-    with opened(chromium, site.links["researcher"], accept_downloads=True) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-filter")
         page.fill('.od-filter [name="rater"]', "Ann")
@@ -135,7 +135,7 @@ def test_parts_of_the_demo_and_the_best_rollouts(chromium, site):
             site.trainer.run, k, snapshot=k, env_steps=16000 * k,
             stats={"predicted": 2.0, "kl": 0.01, "best": 2.5 + k / 10, "timeline": timeline},
         )  # fmt: skip
-    with opened(chromium, site.links["researcher"], accept_downloads=True) as page:
+    with opened(chromium, site.links["researcher"]) as page:
         page.wait_for_selector(".od-parts >> text=iteration 3; between 1.0 and 3.0; weakest at 5.7 s")
         assert (
             page.locator(".od-cells i").count() == 40 and page.locator(".od-cells [data-none]").count() == 4
