@@ -1,9 +1,10 @@
 """Connections of the front: who may hold how many, for how long, and how much may come over one.
 
-Whoever has shown no session is a stranger. Strangers share a fixed number of places; when those are full,
-the oldest connection of the address that holds most of them ends. So a newcomer always gets one, and keeps it
-long enough to show a session: from then on the connection counts as that person's, whom strangers cannot
-crowd out. All places together are fewer than the file descriptors of the process.
+Whoever comes waits in a lobby, which costs a socket and nothing else, until a whole header has come. Then the
+connection is aiohttp's, and, until its request has shown a session, a stranger's. Lobby and strangers have
+fixed numbers of places; when those are taken, the oldest connection of the address that holds most of them
+ends. So a newcomer always gets in. One that shows a session counts as that person's from then on, whom
+strangers cannot crowd out. All places together are fewer than the file descriptors of the process.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import re
 import socket
 import ssl
-from collections.abc import Hashable
+from collections.abc import Coroutine, Hashable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, TypeVar
@@ -25,6 +27,8 @@ from onedemo.app.http.rate_limit import Bucket
 
 log = logging.getLogger("onedemo.page")
 
+HEADER_S = 10.0
+"""Until a whole header has come."""
 STRANGER_S = 30.0
 """How long a connection without a session lasts, from its start or its last complete header."""
 KEEP_ALIVE_S = 75.0
@@ -34,8 +38,13 @@ STALLED_S = 30.0
 HANDSHAKE_S = 10.0
 _LOOK_S = 1.0
 _WANTED_DESCRIPTORS = 16_384
-_WAITING = 512
+_WAITING = 1024
 """Connections that the system holds until they are accepted."""
+_ACCEPTED_AT_ONCE = 64
+_LARGEST_HEADER = 1 << 15
+"""Bytes; aiohttp refuses it, and says so."""
+_NO_REQUEST = re.compile(rb"(?![A-Z]{1,20} \S+ HTTP/1\.[01]\r?\n)[^\n]*\n")
+"""A first line that no header can follow."""
 _NONE_LEFT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 Item = TypeVar("Item", bound=Hashable)
@@ -46,7 +55,7 @@ class Limits:
     """How many connections there may be."""
 
     strangers: int
-    """Without a session."""
+    """Without a session; as many more may wait in the lobby."""
     strangers_each: int
     """Of one address."""
     members: int
@@ -58,7 +67,7 @@ class Limits:
 
     @classmethod
     def of(cls, descriptors: int, *, addresses_known: bool = True) -> Limits:
-        """What a process with so many file descriptors can afford: a third is left for everything else.
+        """What a process with so many file descriptors can afford: a quarter is left for everything else.
 
         Args:
             descriptors: As ``raise_descriptors`` gives it.
@@ -103,11 +112,9 @@ class Crowd(Generic[Item]):
         self._of: dict[Hashable, dict[Item, None]] = {}
         self._count = 0
 
-    def __len__(self) -> int:
-        return self._count
-
-    def __contains__(self, item: tuple[Hashable, Item]) -> bool:
-        return item[1] in self._of.get(item[0], ())
+    def __iter__(self) -> Iterator[Item]:
+        for of in tuple(self._of.values()):
+            yield from tuple(of)
 
     def enter(self, whose: Hashable, item: Item) -> Item | None:
         """Lets an item in, as the newest; returns the one that has to leave for it, if any."""
@@ -136,17 +143,30 @@ class Crowd(Generic[Item]):
         return item
 
 
+class _Visitor:
+    """Somebody in the lobby."""
+
+    __slots__ = ("address", "head", "since", "wire")
+
+    def __init__(self, wire: socket.socket, address: str, since: float) -> None:
+        self.wire, self.address, self.since = wire, address, since
+        self.head = bytearray()
+
+
 class Connection(web.RequestHandler):
-    """One connection, from its acceptance to its end.
+    """One connection, from its first header to its end.
 
     Args:
         held: All connections.
         server: Whose requests come over it.
         wire: The socket.
         address: Where it comes from.
+        head: What has come already.
     """
 
-    def __init__(self, held: Connections, server: web.Server, wire: socket.socket, address: str) -> None:
+    def __init__(
+        self, held: Connections, server: web.Server, wire: socket.socket, address: str, head: bytes
+    ) -> None:
         loop = asyncio.get_running_loop()
         super().__init__(
             server,
@@ -156,7 +176,7 @@ class Connection(web.RequestHandler):
             auto_decompress=False,  # nothing is inflated: see ``onedemo.app.http.refusals``
             lingering_time=2.0,
         )
-        self._held, self._wire, self._clock = held, wire, loop.time
+        self._held, self._wire, self._clock, self._head = held, wire, loop.time, head
         self._carrier: asyncio.Transport | None = None
         self._allowed: Bucket | None = None
         self._untaken, self._untaken_since = 0, 0.0
@@ -169,6 +189,7 @@ class Connection(web.RequestHandler):
         """A whole header has come."""
         if self.stranger:
             self.heard_at = self._clock()
+            self._held.enter(self)
 
     def belongs_to(self, person: int) -> None:
         """Its request has shown a session of this person."""
@@ -206,6 +227,9 @@ class Connection(web.RequestHandler):
         assert isinstance(transport, asyncio.Transport)
         self._carrier = transport
         super().connection_made(transport)
+        head, self._head = self._head, b""
+        if head:
+            self.data_received(head)
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """It has ended."""
@@ -246,9 +270,9 @@ class Connections:
 
     def __init__(self, limits: Limits, *, addresses_known: bool = True) -> None:
         self._addresses_known = addresses_known
+        self._lobby: Crowd[_Visitor] = Crowd(limits.strangers, limits.strangers_each)
         self._strangers: Crowd[Connection] = Crowd(limits.strangers, limits.strangers_each)
         self._members: Crowd[Connection] = Crowd(limits.members, limits.members_each)
-        self._all: set[Connection] = set()
         self._listeners: list[socket.socket] = []
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -264,85 +288,125 @@ class Connections:
         Raises:
             OSError: If the port cannot be opened.
         """
-        loop = asyncio.get_running_loop()
-        # asyncio knows how to bind a name that stands for several addresses; it does not accept for us,
-        # since it knows no limit and, out of descriptors, fills the log.
-        bound = await loop.create_server(asyncio.Protocol, host, port, start_serving=False)
+        self._loop, self._server, self._tls = asyncio.get_running_loop(), server, tls
+        # asyncio knows how to bind a name that stands for several addresses. It does not accept for us: it
+        # knows no limit and, out of descriptors, fills the log.
+        bound = await self._loop.create_server(asyncio.Protocol, host or None, port, start_serving=False)
         self._listeners = [each.dup() for each in bound.sockets]
         bound.close()
         for listener in self._listeners:
             listener.setblocking(False)
             listener.listen(_WAITING)
-            self._keep(self._accept(listener, server, tls))
+            self._loop.add_reader(listener, self._accept, listener)
         self._keep(self._end_overdue())
         return self._listeners[0].getsockname()[1]
 
     async def close(self) -> None:
-        """Accepts nothing any more."""
+        """Accepts nothing any more, and sends those in the lobby away."""
         for task in (tasks := list(self._tasks)):
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        for visitor in self._lobby:
+            self._send_away(visitor)
         for listener in self._listeners:
+            self._loop.remove_reader(listener)
             listener.close()
 
-    def move(self, connection: Connection, person: int) -> None:
-        """A connection turns out to be this person's."""
-        self._crowd(connection).leave(connection.whose, connection)
-        connection.whose, connection.stranger = person, False
-        self._enter(connection)
-
-    def leave(self, connection: Connection) -> None:
-        """A connection has ended."""
-        self._all.discard(connection)
-        self._crowd(connection).leave(connection.whose, connection)
-
-    def _enter(self, connection: Connection) -> None:
+    def enter(self, connection: Connection) -> None:
+        """A connection takes the newest place among those of its kind."""
         out = self._crowd(connection).enter(connection.whose, connection)
         if out is not None:
             out.end()
 
+    def move(self, connection: Connection, person: int) -> None:
+        """A connection turns out to be this person's."""
+        self.leave(connection)
+        connection.whose, connection.stranger = person, False
+        self.enter(connection)
+
+    def leave(self, connection: Connection) -> None:
+        """A connection has ended."""
+        self._crowd(connection).leave(connection.whose, connection)
+
     def _crowd(self, connection: Connection) -> Crowd[Connection]:
         return self._strangers if connection.stranger else self._members
 
-    def _keep(self, coroutine) -> None:
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    # The lobby
 
-    async def _accept(self, listener: socket.socket, server: web.Server, tls: ssl.SSLContext | None) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
+    def _accept(self, listener: socket.socket) -> None:
+        for _ in range(_ACCEPTED_AT_ONCE):
             try:
-                wire, address = await loop.sock_accept(listener)
+                wire, address = listener.accept()
             except OSError as error:
                 if error.errno in _NONE_LEFT:
                     log.error("no connection can be accepted: %s", error.strerror)
-                    await asyncio.sleep(0.2)
-                continue
+                    self._loop.remove_reader(listener)
+                    self._loop.call_later(_LOOK_S, self._accept_again, listener)
+                return
             wire.setblocking(False)
             place = network(address[0]) if self._addresses_known else ""
-            connection = Connection(self, server, wire, place)
-            self._all.add(connection)
-            self._enter(connection)
-            self._keep(self._join(connection, wire, tls))
+            visitor = _Visitor(wire, place, self._loop.time())
+            out = self._lobby.enter(place, visitor)
+            if out is not None:
+                self._send_away(out)
+            self._loop.add_reader(wire, self._hear, visitor)
+            self._hear(visitor)  # mostly it has spoken already
 
-    async def _join(self, connection: Connection, wire: socket.socket, tls: ssl.SSLContext | None) -> None:
-        loop = asyncio.get_running_loop()
-        timeouts = {} if tls is None else {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": 2.0}
+    def _accept_again(self, listener: socket.socket) -> None:
+        if listener.fileno() >= 0:
+            self._loop.add_reader(listener, self._accept, listener)
+
+    def _hear(self, visitor: _Visitor) -> None:
         try:
-            await loop.connect_accepted_socket(lambda: connection, wire, ssl=tls, **timeouts)
-        except (OSError, TimeoutError):  # left, or speaks no TLS
+            said = visitor.wire.recv(1, socket.MSG_PEEK) if self._tls else visitor.wire.recv(1 << 14)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            said = b""
+        if not said:
+            self._send_away(visitor)
+            return
+        head = visitor.head
+        if not self._tls:
+            head += said
+            whole = b"\r\n\r\n" in head or len(head) > _LARGEST_HEADER or _NO_REQUEST.match(head)
+            if not whole:
+                return
+        self._loop.remove_reader(visitor.wire)
+        self._lobby.leave(visitor.address, visitor)
+        connection = Connection(self, self._server, visitor.wire, visitor.address, bytes(head))
+        self.enter(connection)
+        self._keep(self._join(connection, visitor.wire))
+
+    def _send_away(self, visitor: _Visitor) -> None:
+        self._lobby.leave(visitor.address, visitor)
+        self._loop.remove_reader(visitor.wire)
+        visitor.wire.close()
+
+    # Tasks
+
+    def _keep(self, coroutine: Coroutine[None, None, None]) -> None:
+        task = self._loop.create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _join(self, connection: Connection, wire: socket.socket) -> None:
+        timeouts = {"ssl_handshake_timeout": HANDSHAKE_S, "ssl_shutdown_timeout": 2.0} if self._tls else {}
+        try:
+            await self._loop.connect_accepted_socket(lambda: connection, wire, ssl=self._tls, **timeouts)
+        except BaseException as error:
             wire.close()
             self.leave(connection)
-        except BaseException:
-            wire.close()
-            self.leave(connection)
-            raise
+            if not isinstance(error, (OSError, TimeoutError)):  # left, or speaks no TLS
+                raise
 
     async def _end_overdue(self) -> None:
         while True:
             await asyncio.sleep(_LOOK_S)
-            now = asyncio.get_running_loop().time()
-            for connection in tuple(self._all):
+            now = self._loop.time()
+            for visitor in self._lobby:
+                if now - visitor.since > HEADER_S:
+                    self._send_away(visitor)
+            for connection in (*self._strangers, *self._members):
                 if connection.overdue(now):
                     connection.end()
