@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AsyncExitStack, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,10 +59,10 @@ class Seen:
     kind: str
     health_s: list[float] = field(default_factory=list)
     next_clip_s: list[float] = field(default_factory=list)
-    page_s: float = 0.0
+    page_s: float = _PATIENCE_S
     """Until somebody who comes during the attack has a clip."""
     log_mb: float = 0.0
-    seconds: float = 0.0
+    seconds: float = _PATIENCE_S
     notes: list[str] = field(default_factory=list)
 
     def figures(self) -> dict[str, float]:
@@ -167,42 +167,32 @@ async def come_in(link: str, seen: Seen) -> None:
 async def under(kind: str, site: Site, connections: int, seconds: float, given: Counter) -> Seen:
     """Rates for so long while one attack goes on; "" is none."""
     seen = Seen(kind or "none")
-    link = link_of(site, "bo")
-    async with browser_session() as session:
-        tab = await open_tab(session, link)
-        await tab.until(lambda: tab.clip, "a clip", _PATIENCE_S)
-        attacker = None
-        if kind:
-            guest = await open_tab(session, link_of(site, "mallory"))
-            words = [
-                kind,
-                site.port,
-                connections,
-                seconds + 60,
-                guest.headers["Cookie"],
-                guest.address[len(site.base) :],
-            ]
-            attacker = subprocess.Popen([sys.executable, attackers.__file__, *map(str, words)])
-            await guest.close()
-            await asyncio.sleep(min(3.0, seconds / 2))
-        size, began = site.log.stat().st_size, time.monotonic()
-        health = asyncio.ensure_future(watch_health(site, seen))
-        comer = asyncio.ensure_future(come_in(link_of(site, "cy"), seen))
+    async with browser_session() as session, AsyncExitStack() as stack:
+        size = site.log.stat().st_size
         try:
+            tab = await open_tab(session, link_of(site, "bo"))
+            stack.push_async_callback(tab.close)
+            await tab.until(lambda: tab.clip, "a clip", _PATIENCE_S)
+            if kind:
+                guest = await open_tab(session, link_of(site, "mallory"))
+                await guest.close()
+                place = guest.address.removeprefix(site.base)
+                words = [kind, site.port, connections, seconds + 120, guest.headers["Cookie"], place]
+                attacker = subprocess.Popen([sys.executable, attackers.__file__, *map(str, words)])
+                stack.callback(attacker.wait)
+                stack.callback(attacker.kill)
+                await asyncio.sleep(min(3.0, seconds / 2))
+            began = time.monotonic()
+            health = asyncio.ensure_future(watch_health(site, seen))
+            stack.callback(health.cancel)
+            comer = asyncio.ensure_future(come_in(link_of(site, "cy"), seen))
+            stack.callback(comer.cancel)
             await rate(tab, seen, began + seconds, given)
             await comer
-        except (RuntimeError, aiohttp.ClientError, OSError) as error:
+            seen.seconds = time.monotonic() - began
+        except (RuntimeError, aiohttp.ClientError, OSError, TimeoutError) as error:
             seen.notes.append(f"somebody could not rate: {error!r}")
-        finally:
-            if attacker is not None:
-                attacker.kill()
-                attacker.wait()
-            for task in (health, comer):
-                task.cancel()
-            await asyncio.gather(health, comer, return_exceptions=True)
-        seen.seconds = time.monotonic() - began
         seen.log_mb = (site.log.stat().st_size - size) / 1e6
-        await tab.close()
     return seen
 
 
