@@ -89,8 +89,8 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         one_of("method", self.method, METHODS)
-        if self.seed < 0:
-            raise ValueError(f"seed must be at least 0, got {self.seed}")
+        if not 0 <= self.seed < 2**63:  # as large as SQLite's numbers
+            raise ValueError(f"seed must be at least 0 and less than 2**63, got {self.seed}")
         if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
             raise ValueError(f'device must be "cpu", "cuda" or "cuda:N", got {self.device!r}')
 

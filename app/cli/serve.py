@@ -14,6 +14,8 @@ from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
+from onedemo.core.log_limit import limit_logs
+from onedemo.core.process import end_within
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
@@ -22,6 +24,8 @@ from onedemo.vision.encoders import make_encoder
 
 _SWITCH_SECONDS = 0.0005
 """A press passes through five threads. Each would wait Python's usual 5 ms for a trainer that computes."""
+_END_SECONDS = 8.0
+"""What ends in good order is given that time; the rest is resumed as after a kill."""
 
 
 def serve(
@@ -59,6 +63,7 @@ def serve(
     listening.ssl_context()  # before anything is written
     check_port(listening.host, listening.port)
     sys.setswitchinterval(_SWITCH_SECONDS)
+    limit_logs()
     store = Store(data_dir)
     renderer = RenderThread(at_once=False)  # the page says what is wrong
     secret = read_secret(data_dir)
@@ -84,6 +89,7 @@ def serve(
             rater = store.accounts.ensure(role, role)
             print(f"{role}: {issue_link(store, secret, rater, url)}", flush=True)
         ended.wait()
+        end_within(_END_SECONDS)
     finally:
         front.close()
         page.close()

@@ -9,11 +9,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Literal, NamedTuple
+from urllib.parse import parse_qs
 
 from aiohttp import web
 
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
+from onedemo.app.http.refusals import read_body
 from onedemo.app.http.tokens import hash_token, new_session_token
 from onedemo.app.templates import render
 from onedemo.storage.accounts import SESSION_DAYS, Link
@@ -56,6 +58,8 @@ SECURITY_HEADERS = {
 
 _RANK = {"annotator": 1, "researcher": 2}
 """Each may do what those before it may. Whoever is not named is a stranger."""
+_LONGEST_LOGIN = 1024
+"""Bytes of the form of the login page."""
 _MOST_SESSIONS = 8
 """Sessions of one browser that are looked at."""
 
@@ -73,7 +77,8 @@ class AccessControl:
         self._store = store
         self._listening = listening
         self._port = port
-        self._wrong = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
+        self.offences = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
+        """Of each sender: wrong links, and requests that no browser sends."""
 
     def application(self, routes: Iterable[Route]) -> web.Application:
         """A server of these routes and nothing else."""
@@ -171,16 +176,17 @@ class AccessControl:
 
     async def press_button(self, request: web.Request) -> web.StreamResponse:
         """Opens the link of the page with the button."""
-        fields = await request.post()
-        token = fields.get("token", "")
-        if not isinstance(token, str) or not token:
+        if request.content_type != "application/x-www-form-urlencoded":
+            raise web.HTTPUnsupportedMediaType(text="A link is opened by the form of its page.")
+        body = await read_body(request, _LONGEST_LOGIN)
+        fields = parse_qs(body.decode("utf-8", "replace"))
+        token = fields.get("token", [""])[0]
+        if not token:
             return self._login_page(403, _REFUSED["unknown"])
         link = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         return await self._open(request, token, link)
 
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
-        if self._wrong[self._listening.client(request)].empty:
-            return self._login_page(429, _REFUSED["too many"])
         session = new_session_token()
         opened = None
         if link is not None:
@@ -204,8 +210,9 @@ class AccessControl:
         return response
 
     async def _refuse(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
+        if not self.offences[self._listening.sender(request)].take():  # of links that open, none is refused
+            return self._login_page(429, _REFUSED["too many"])
         address = self._listening.client(request)
-        self._wrong[address].take()
         why = "unknown" if link is None else link.state
         await asyncio.to_thread(self._store.audit.add, address, "sign-in refused", f"{why} link")
         if link is None:

@@ -89,18 +89,42 @@ class Listening:
     def client(self, request: web.BaseRequest) -> str:
         """The address of who asks."""
         if self.behind_proxy:
-            last = request.headers.get("X-Forwarded-For", "").rsplit(",", 1)[-1].strip()
-            try:
-                return str(ipaddress.ip_address(last))
-            except ValueError:
-                pass
+            # Whoever asks may send lines of their own; the proxy's word is the last of the last.
+            last = ",".join(request.headers.getall("X-Forwarded-For", ())).rsplit(",", 1)[-1]
+            if (address := read_address(last)) is not None:
+                return str(address)
         return request.remote or "unknown"
+
+    def sender(self, request: web.BaseRequest) -> str:
+        """Who asks, as far as limits are counted: the address, or its network."""
+        return network(self.client(request))
 
     def encrypted(self, request: web.BaseRequest) -> bool:
         """Whether the way to the browser is encrypted: cookies then never go another way."""
         if self.behind_proxy:
             return request.headers.get("X-Forwarded-Proto", "").lower() == "https"
         return request.secure
+
+
+def read_address(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """An address as proxies write it, with or without a port and brackets; None if it is none."""
+    text = text.strip()
+    for form in (r"\[([0-9A-Fa-f:.]+)\](?::\d{1,5})?", r"(\d+\.\d+\.\d+\.\d+):\d{1,5}", r"(.+)"):
+        if found := re.fullmatch(form, text, re.ASCII):
+            try:
+                address = ipaddress.ip_address(found[1])
+            except ValueError:
+                return None
+            return getattr(address, "ipv4_mapped", None) or address
+    return None
+
+
+def network(address: str) -> str:
+    """What counts as one sender: an IPv4 address, or the /64 that one line has of IPv6."""
+    known = read_address(address.partition("%")[0])
+    if isinstance(known, ipaddress.IPv6Address):
+        return str(ipaddress.ip_network((known, 64), strict=False))
+    return address if known is None else str(known)
 
 
 def is_loopback(host: str) -> bool:

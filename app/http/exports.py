@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import tempfile
 from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
@@ -23,6 +24,7 @@ from onedemo.storage.store import Store
 FILTERS = ("run", "rater", "stage", "value", "choice", "repeat", "left_out")
 """Columns of the ratings by which they can be filtered."""
 _NUMBERS = ("value", "repeat", "left_out")
+_NUMBER = re.compile(r"[0-9]{0,9}")
 _SHOWN = 50
 """Ratings in a preview."""
 
@@ -122,7 +124,7 @@ def read_filters(query) -> dict[str, Any]:
     """
     filters: dict[str, Any] = {}
     for name, value in query.items():
-        if name not in FILTERS or len(value) > 200 or (name in _NUMBERS and value and not value.isdigit()):
+        if name not in FILTERS or len(value) > 200 or (name in _NUMBERS and not _NUMBER.fullmatch(value)):
             raise web.HTTPBadRequest(text=f"Ratings cannot be filtered by {name[:40]!r} {value[:40]!r}.")
         if value:
             filters[name] = int(value) if name in _NUMBERS else value

@@ -21,7 +21,13 @@ BYTES_PER_S, BYTES_AT_ONCE = 100_000.0, 1_000_000
 LARGEST_MESSAGE = 1 << 16
 """Bytes; what the page needs is a few hundred."""
 WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE = 1 / 6, 20
-"""Of one address."""
+"""Of one sender: wrong links, and requests that no browser sends."""
+PRESSES_PER_S, PRESSES_AT_ONCE = 20.0, 100
+"""Of one person."""
+PRESSES_WAITING, PRESSES_WAITING_EACH = 256, 4
+"""Presses that are being carried out, of all people and of one."""
+ACTIONS_WAITING = 4
+"""Actions of researchers that are being carried out, one after the other."""
 _MOST_KEYS = 10_000
 
 

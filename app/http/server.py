@@ -9,12 +9,14 @@ key handling added.
 from __future__ import annotations
 
 import asyncio
-import logging
 import socket
 import sqlite3
 import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib.metadata import version
-from typing import Protocol
+from typing import Any, Protocol
 
 from aiohttp import web
 
@@ -24,15 +26,31 @@ from onedemo.app.http import assets
 from onedemo.app.http.auth import RATER, SECURITY_HEADERS, AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.commands import Actions
+from onedemo.app.http.connections import Connections, Limits, raise_descriptors
 from onedemo.app.http.exports import Downloads
 from onedemo.app.http.media import Files, Filmed
+from onedemo.app.http.rate_limit import (
+    ACTIONS_WAITING,
+    PRESSES_AT_ONCE,
+    PRESSES_PER_S,
+    PRESSES_WAITING,
+    PRESSES_WAITING_EACH,
+    Buckets,
+    Places,
+)
+from onedemo.app.http.refusals import Refusals, read_body, read_json
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.types import Status
 
-log = logging.getLogger("onedemo.page")
+_CLOSE_S = 1.0
+"""What requests that are being answered have when the port closes."""
+_HEALTH_S = 5.0
+"""A trainer that has not said by then how it is, is not well."""
+_PRESSING_THREADS = 8
+_TLS_ALONE = {"Strict-Transport-Security": "max-age=31536000"}
 
 
 class Trained(Filmed, Protocol):
@@ -95,7 +113,18 @@ class Front:
         self._downloads = Downloads(store, SECURITY_HEADERS)
         self._uploads = Uploads(store.path.parent)
         self._access = AccessControl(store, listening, lambda: self._port)
-        self._proxy = Proxy(page, store)
+        self._refusals = Refusals(listening, self._access.offences, _person)
+        limits = Limits.of(raise_descriptors(), addresses_known=not listening.behind_proxy)
+        self._connections = Connections(limits, addresses_known=not listening.behind_proxy)
+        self._proxy = Proxy(page, store, most_pages=limits.pages)
+        # Threads of their own: whatever waits in one of them, nothing else waits for it.
+        self._pressing = ThreadPoolExecutor(_PRESSING_THREADS, "onedemo-press")
+        self._acting = ThreadPoolExecutor(1, "onedemo-action")
+        self._looking = ThreadPoolExecutor(1, "onedemo-health")
+        self._presses = Buckets(PRESSES_PER_S, PRESSES_AT_ONCE)
+        self._pressed = Places(PRESSES_WAITING, PRESSES_WAITING_EACH)
+        self._acted = Places(ACTIONS_WAITING, ACTIONS_WAITING)
+        self._health_asked: asyncio.Future[Status] | None = None
         self._html = assets.page_html()
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
@@ -163,6 +192,7 @@ class Front:
 
     def _run(self, ready: threading.Event, failure: list[BaseException]) -> None:
         asyncio.set_event_loop(self._loop)
+        self._loop.set_default_executor(threads := ThreadPoolExecutor(thread_name_prefix="onedemo-front"))
         try:
             self._loop.run_until_complete(self._serve(ready))
         except Exception as error:  # whatever it is: the caller must not believe the port open
@@ -171,25 +201,43 @@ class Front:
             # What is still being answered would ask for a thread after there are none.
             for task in (left := asyncio.all_tasks(self._loop)):
                 task.cancel()
-            self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
-            self._loop.run_until_complete(self._loop.shutdown_default_executor())
+            self._loop.run_until_complete(asyncio.wait(left, timeout=_CLOSE_S) if left else asyncio.sleep(0))
+            pools = (threads, self._pressing, self._acting, self._looking)
+            ends = [threading.Thread(target=pool.shutdown, daemon=True) for pool in pools]
+            for end in ends:
+                end.start()
+            for end in ends:
+                end.join(_CLOSE_S)  # a film that is being drawn is not waited for
+            for pool in pools:
+                pool.shutdown(wait=False, cancel_futures=True)
             self._loop.close()
             ready.set()
 
     async def _serve(self, ready: threading.Event) -> None:
         application = self._access.application(self.routes())
-        runner = web.AppRunner(application, access_log=None, shutdown_timeout=2)
+        application.middlewares.insert(0, self._refusals.around)
+        application.middlewares.append(self._refusals.within)
+        application.on_response_prepare.append(self._add_headers)
+        runner = web.AppRunner(application, access_log=None, shutdown_timeout=_CLOSE_S)
         await runner.setup()
+        assert runner.server is not None
         await self._proxy.open()
         try:
-            site = web.TCPSite(runner, self._host, self._port, ssl_context=self._tls)
-            await site.start()
-            self._port = runner.addresses[0][1]
+            self._port = await self._connections.open(runner.server, self._host, self._port, self._tls)
             ready.set()
             await self._stop.wait()
         finally:
+            await self._connections.close()
             await self._proxy.close()
             await runner.cleanup()
+
+    async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
+        response.headers["Server"] = "onedemo"  # else aiohttp tells its version, and Python's
+        for name, value in SECURITY_HEADERS.items():
+            response.headers.setdefault(name, value)
+        response.headers.setdefault("Cache-Control", "no-store")
+        if self._listening.encrypted(request):
+            response.headers.update(_TLS_ALONE)
 
     # What is nobody else's
 
@@ -202,32 +250,54 @@ class Front:
         return web.Response(text=self._html, content_type="text/html")
 
     async def _health(self, request: web.Request) -> web.Response:
-        status = self._page.trainer.status()
-        healthy = status.phase != "failed"
-        return web.json_response({"ok": healthy, "version": version("onedemo"), "phase": status.phase})
+        try:
+            phase = (await asyncio.wait_for(asyncio.shield(self._status()), _HEALTH_S)).phase
+        except (sqlite3.Error, TimeoutError):
+            phase = "busy"
+        healthy = phase not in ("failed", "busy")
+        told = {"ok": healthy, "version": version("onedemo"), "phase": phase}
+        return web.json_response(told, status=200 if healthy else 503)
+
+    def _status(self) -> asyncio.Future[Status]:
+        """What the trainer does, which the database is asked for: once at a time, whoever asks."""
+        if self._health_asked is None or self._health_asked.done():
+            self._health_asked = asyncio.wrap_future(
+                self._looking.submit(lambda: self._page.trainer.status()), loop=self._loop
+            )
+        return self._health_asked
 
     async def _press(self, request: web.Request) -> web.Response:
-        body = await request.read()
-        try:
-            counted = await asyncio.to_thread(self._page.press, request[RATER].id, read_press(body))
-        except (PageGone, AnsweredElsewhere) as told:
-            raise web.HTTPConflict(text=str(told)) from None
-        except ValueError as error:
-            raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
-        except sqlite3.Error as error:
-            log.exception("a press could not be saved")
-            text = f"This could not be saved ({error}). Nothing is lost: please try again."
-            raise web.HTTPServiceUnavailable(text=text) from None
+        rater = request[RATER].id
+        if not self._presses[str(rater)].take():
+            raise web.HTTPTooManyRequests(text="That was too fast for anybody. Please press once more.")
+        with self._pressed.one(rater) as free:
+            if not free:
+                raise web.HTTPServiceUnavailable(text="Earlier answers are still being saved: please wait.")
+            try:
+                press = read_press(await read_body(request))
+                counted = await self._in_turn(self._pressing, self._page.press, rater, press)
+            except (PageGone, AnsweredElsewhere) as told:
+                raise web.HTTPConflict(text=str(told)) from None
+            except ValueError as error:
+                raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
         return web.json_response({"counted": counted})
 
     async def _do(self, request: web.Request) -> web.Response:
-        try:
-            await asyncio.to_thread(self._actions.do, request[RATER], await request.json())
-        except (ValueError, UserError) as error:
-            raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
-        except sqlite3.Error as error:
-            raise web.HTTPServiceUnavailable(text=f"This could not be saved ({error}).") from None
+        with self._acted.one(0) as free:
+            if not free:
+                raise web.HTTPServiceUnavailable(text="Other changes are still being made: please wait.")
+            try:
+                await self._in_turn(self._acting, self._actions.do, request[RATER], await read_json(request))
+            except (ValueError, UserError) as error:
+                raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
         return web.Response(status=204)
+
+    async def _in_turn(self, threads: ThreadPoolExecutor, work: Callable[..., Any], *values: Any) -> Any:
+        return await self._loop.run_in_executor(threads, partial(work, *values))
+
+
+def _person(request: web.Request) -> int | None:
+    return request[RATER].id if RATER in request else None
 
 
 def _explain(error: BaseException, host: str, port: int) -> UserError:

@@ -6,12 +6,22 @@ Viser serves nothing else that a browser needs, so nothing else is passed on.
 from __future__ import annotations
 
 import asyncio
+import re
 import sqlite3
 from typing import Protocol
 
-from aiohttp import ClientSession, ClientWebSocketResponse, WSCloseCode, WSMsgType, web
+from aiohttp import (
+    ClientError,
+    ClientSession,
+    ClientTimeout,
+    ClientWebSocketResponse,
+    WSCloseCode,
+    WSMsgType,
+    web,
+)
 
 from onedemo.app.http.auth import RATER, SESSION, same_origin
+from onedemo.app.http.connections import Connection
 from onedemo.app.http.rate_limit import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
@@ -30,6 +40,10 @@ RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"
 SCHEME_HEADER = "X-Onedemo-Scheme"
 
+_PROTOCOL = re.compile(r"viser-v[0-9A-Za-z.+-]{1,40}")
+_CONNECT_S = 10.0
+_CLOSE_S = 2.0
+"""What a browser has to answer that its page is closed."""
 _LOOK_S = 1.0
 """How soon a page is closed whose session has ended."""
 
@@ -47,27 +61,29 @@ class Proxy:
     Args:
         page: The Viser page behind the door.
         store: Knows whose session still holds.
+        most_pages: Open at once.
     """
 
-    def __init__(self, page: Behind, store: Store) -> None:
+    def __init__(self, page: Behind, store: Store, *, most_pages: int = MOST_PAGES) -> None:
         self._page, self._store = page, store
         self._sockets: dict[web.WebSocketResponse, str] = {}
         """Each open page, with the session it belongs to."""
-        self._places = Places(MOST_PAGES, MOST_PAGES_EACH)
+        self._places = Places(most_pages, MOST_PAGES_EACH)
         self._upstream: ClientSession | None = None
         self._watching: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Makes it ready, in the loop it is used in."""
-        self._upstream = ClientSession()
+        self._upstream = ClientSession(timeout=ClientTimeout(total=None, sock_connect=_CONNECT_S))
         self._watching = asyncio.ensure_future(self._end_sessions())
 
     async def close(self) -> None:
         """Closes every page's socket."""
         if self._watching is not None:
             self._watching.cancel()
-        for browser in tuple(self._sockets):
-            await browser.close(code=1001)
+        if self._sockets:  # whoever does not answer is not waited for
+            ends = [asyncio.ensure_future(each.close(code=WSCloseCode.GOING_AWAY)) for each in self._sockets]
+            await asyncio.wait(ends, timeout=_CLOSE_S)
         if self._upstream is not None:
             await self._upstream.close()
 
@@ -84,8 +100,10 @@ class Proxy:
 
     async def _join(self, request: web.Request) -> web.StreamResponse:
         assert self._upstream is not None
-        offered = request.headers.get("Sec-WebSocket-Protocol", "")
-        protocols = [name.strip() for name in offered.split(",") if name.strip()]
+        offered = ",".join(request.headers.getall("Sec-WebSocket-Protocol", ()))
+        protocols = [name.strip() for name in offered.split(",")]
+        if not all(_PROTOCOL.fullmatch(name) for name in protocols):
+            raise web.HTTPBadRequest(text="Only the page itself can use this connection.")
         scheme = "dark" if request.cookies.get("scheme") == "dark" else "light"
         # Only what is named here goes on: nothing of the client's own headers reaches Viser.
         identity = {
@@ -93,17 +111,24 @@ class Proxy:
             SECRET_HEADER: self._page.secret,
             SCHEME_HEADER: scheme,
         }
-        inside = await self._upstream.ws_connect(
-            f"http://127.0.0.1:{self._page.port}/",
-            protocols=protocols,
-            headers=identity,
-            max_msg_size=0,
-        )
+        try:
+            async with asyncio.timeout(_CONNECT_S):
+                inside = await self._upstream.ws_connect(
+                    f"http://127.0.0.1:{self._page.port}/",
+                    protocols=protocols,
+                    headers=identity,
+                    max_msg_size=0,
+                )
+        except (ClientError, TimeoutError):
+            raise web.HTTPServiceUnavailable(text="The page cannot be had just now. Please reload.") from None
         async with inside:
             outside = web.WebSocketResponse(
-                protocols=protocols, heartbeat=30, max_msg_size=LARGEST_MESSAGE, compress=False
-            )
+                protocols=protocols, heartbeat=30, max_msg_size=LARGEST_MESSAGE, compress=False,
+                autoping=False, timeout=_CLOSE_S,
+            )  # fmt: skip
             await outside.prepare(request)
+            if isinstance(request.protocol, Connection):  # whatever they are part of: frames, too, cost time
+                request.protocol.allow(Bucket(BYTES_PER_S, BYTES_AT_ONCE))
             self._sockets[outside] = request[SESSION]
             try:
                 await _pump(inside, outside)
@@ -147,10 +172,12 @@ async def _show(inside: ClientWebSocketResponse, outside: web.WebSocketResponse)
 
 async def _listen(outside: web.WebSocketResponse, inside: ClientWebSocketResponse) -> None:
     """Passes on what a browser may say, and drops the rest; a flood ends the connection."""
-    messages, sizes = Bucket(MESSAGES_PER_S, MESSAGES_AT_ONCE), Bucket(BYTES_PER_S, BYTES_AT_ONCE)
+    messages = Bucket(MESSAGES_PER_S, MESSAGES_AT_ONCE)
     async for message in outside:
-        if not (messages.take() and sizes.take(len(message.data or b""))):
+        if not messages.take():
             await outside.close(code=WSCloseCode.POLICY_VIOLATION, message=b"too many messages")
             return
-        if message.type is WSMsgType.BINARY and known(message.data):
+        if message.type is WSMsgType.PING:
+            await outside.pong(message.data)
+        elif message.type is WSMsgType.BINARY and known(message.data):
             await inside.send_bytes(message.data)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
 from onedemo.core.files import hold
+from onedemo.core.log_limit import LogLimit
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.render.renderer import RenderThread
@@ -145,6 +146,7 @@ def _log_to(file: Path) -> Iterator[None]:
     """Writes the log into a file for as long as the block lasts."""
     handler = logging.FileHandler(file)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.addFilter(LogLimit())
     logger = logging.getLogger("onedemo")
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import threading
+import time
 
 GL_OFF = ("disable", "disabled", "off", "false", "0")
 """Values of ``MUJOCO_GL`` that turn pictures off."""
@@ -52,3 +54,21 @@ def libegl_loads() -> bool:
     except OSError:
         return False
     return True
+
+
+def end_within(seconds: float, code: int = 0) -> None:
+    """Ends the process after that time at the latest, whatever its threads are doing.
+
+    For a program that has been told to end, and whose files are whole at any moment.
+
+    Args:
+        seconds: What an orderly end may take.
+        code: Of the exit.
+    """
+
+    def end() -> None:
+        time.sleep(seconds)
+        sys.stdout.flush()
+        os._exit(code)
+
+    threading.Thread(target=end, name="onedemo-end", daemon=True).start()
