@@ -37,10 +37,13 @@
     setTimeout(() => button.classList.remove("od-pressed"), 180);
   }
 
+  // What the server asks of whatever changes something: no other site can read it.
+  const named = () => ({ "X-Onedemo-Page": shown(".od-header")?.dataset.page ?? "" });
+
   async function post(where, what, options = {}) {
-    const answer = await fetch(`${location.pathname}/${where}`, {
+    const answer = await fetch(where, {
       method: "POST",
-      headers: { "Content-Type": "application/json" },
+      headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(what),
       ...options,
     });
@@ -200,6 +203,11 @@
     else if ("step" in data) local(data.step === "1" ? "ArrowRight" : "ArrowLeft");
     else if ("mark" in data) local("m");
     else if ("help" in data) local("?");
+    else if ("signOut" in data)
+      post("signout", {}).then(
+        (answer) => location.assign(answer.url),
+        (error) => say(error.message),
+      );
     else if ("unmark" in data) main()?.setMark(null);
     else if (data.video) {
       const film = shown(".od-film");
@@ -282,9 +290,11 @@
     if (!form) return;
     event.preventDefault();
     const place = form.parentElement.querySelector(".od-preview");
-    fetch(`/preview${query(form)}`)
-      .then((answer) => answer.text())
-      .then((html) => (place.innerHTML = html));
+    fetch(`preview${query(form)}`).then(async (answer) => {
+      const text = await answer.text();
+      if (!answer.ok) return (place.textContent = text);
+      place.replaceChildren(...new DOMParser().parseFromString(text, "text/html").body.childNodes);
+    });
   });
   // A form that is an action.
   document.addEventListener("submit", (event) => {
@@ -322,6 +332,7 @@
     };
     request.onerror = () => done("The connection was lost during the upload. Please try again.");
     request.open("POST", form.dataset.upload);
+    for (const [name, value] of Object.entries(named())) request.setRequestHeader(name, value);
     button.disabled = true;
     place.textContent = "Uploading";
     request.send(new FormData(form));

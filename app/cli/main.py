@@ -30,6 +30,7 @@ _APP_ONLY = (
     "pyarrow",
     "rich",
     "viser",
+    "zstandard",
 )
 """Packages of the extra ``app``: the library does without, the page and the data set do not."""
 

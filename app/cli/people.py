@@ -17,7 +17,7 @@ rater = App(name="rater", help="People and their links.")
 
 @rater.command
 def add(
-    name: str, /, *, researcher: bool = False, url: str = "http://127.0.0.1:8080", once: bool = False,
+    name: str, /, *, researcher: bool = False, url: str | None = None, once: bool = False,
     expires: str | None = None, data_dir: DataDir = DATA,
 ) -> None:  # fmt: skip
     """A new rater, or another link of one; prints the link to send.
@@ -25,16 +25,17 @@ def add(
     Args:
         name: What to call them.
         researcher: May watch, steer and export too.
-        url: Address people reach the page at.
+        url: Address people reach the page at [default: that of the server of this data directory].
         once: A link that opens once.
         expires: A link that ends after a time: 30m, 12h, 7d.
     """
-    from onedemo.app.http.tokens import issue_link, passing_link, read_secret, read_span
+    from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, read_span
     from onedemo.core.names import check_person
 
     name = check_person(name)
     lasts = read_span(expires) if expires is not None else None
     with open_store(data_dir) as store:
+        url = url or read_address(data_dir)
         person = store.accounts.ensure(name, "researcher" if researcher else "annotator")
         if once or lasts is not None:
             url = passing_link(store, person, url, once=once, lasts=lasts)

@@ -62,8 +62,8 @@ def settings_help() -> str:
 def serve(
     options: RunOptions = NONE, *,
     host: str = "127.0.0.1", port: Whole = 8080, tls_cert: Path | None = None, tls_key: Path | None = None,
-    behind_proxy: bool = False, allow_host: list[str] | None = None, new_run: bool = False,
-    shared: float = 0.1, repeated: float = 0.04, compare: bool = False,
+    behind_proxy: bool = False, allow_host: list[str] | None = None, base_path: str = "",
+    new_run: bool = False, shared: float = 0.1, repeated: float = 0.04, compare: bool = False,
 ) -> None:  # fmt: skip
     """The web app with its trainer thread.
 
@@ -75,6 +75,7 @@ def serve(
         tls_key: Its private key, PEM.
         behind_proxy: A proxy that speaks TLS is before it, and is believed.
         allow_host: A host name that people use, such as study.example.org; may be repeated.
+        base_path: What all addresses begin with, such as /study1, if a proxy passes on only that.
         new_run: Start over instead of resuming.
         shared: Share of clips shown to several people.
         repeated: Share of clips shown to the same person again.
@@ -90,6 +91,7 @@ def serve(
     listening = Listening(
         host=host, port=port, tls_cert=tls_cert, tls_key=tls_key,
         behind_proxy=behind_proxy, names=tuple(allow_host or ()),
+        base_path=base_path.rstrip("/"),
     )  # fmt: skip
     overrides = options.overrides()
     config = load_config(options.config, overrides)

@@ -10,7 +10,7 @@ from pathlib import Path
 from onedemo.app.annotation.assignment import Again
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front, check_port
-from onedemo.app.http.tokens import issue_link, read_secret
+from onedemo.app.http.tokens import issue_link, read_secret, write_address
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
@@ -84,6 +84,7 @@ def serve(
         signal.signal(number, lambda *_: ended.set())
     try:
         url = front.start()
+        write_address(data_dir, url)
         study.trainer.start()
         for role in ("researcher", "annotator"):
             rater = store.accounts.ensure(role, role)

@@ -13,14 +13,15 @@ from urllib.parse import parse_qs
 
 from aiohttp import web
 
+from onedemo.app.http import assets
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
 from onedemo.app.http.refusals import read_body
+from onedemo.app.http.sessions import RATER, Sessions
 from onedemo.app.http.tokens import hash_token, new_session_token
 from onedemo.app.templates import render
 from onedemo.storage.accounts import SESSION_DAYS, Link
 from onedemo.storage.store import Store
-from onedemo.types import Rater
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 Role = Literal["stranger", "annotator", "researcher"]
@@ -35,33 +36,27 @@ class Route(NamedTuple):
     handler: Handler
     audit: str = ""
     """What the audit log says when it was served; "" for what is not worth a line."""
+    names_page: bool = True
+    """Of a POST: whether it is let through only if it names an open page. A handler that looks for itself at
+    something that no other site can know, such as the token of a link, says no."""
 
 
-RATER = web.RequestKey("rater", Rater)
-SESSION = web.RequestKey("session", str)
-"""The hash of the cookie's token."""
+PAGE_HEADER = "X-Onedemo-Page"
+"""In what a page sends: the name of that page. Another site can neither read it nor send such a header."""
 
-# Viser's script is inline and compressed, hence unsafe-inline and WebAssembly. The one thing that
-# asks for unsafe-eval is its sorter of Gaussian splats, which we do not show: it is refused.
 SECURITY_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' blob:; worker-src blob:; "
-        "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self'; "
-        "font-src 'self' data:; "
-        # Viser follows ?websocket=ws://elsewhere; this keeps it at home.
-        "connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-    ),
+    "Content-Security-Policy": assets.POLICY,
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
 }
 
 _RANK = {"annotator": 1, "researcher": 2}
 """Each may do what those before it may. Whoever is not named is a stranger."""
 _LONGEST_LOGIN = 1024
 """Bytes of the form of the login page."""
-_MOST_SESSIONS = 8
-"""Sessions of one browser that are looked at."""
 
 
 class AccessControl:
@@ -71,12 +66,17 @@ class AccessControl:
         store: Knows the tokens.
         listening: Which hosts may be named, and who asks.
         port: Tells the port of the front, once it is open.
+        is_open: Whether a rater, by number, has a page of that name open.
     """
 
-    def __init__(self, store: Store, listening: Listening, port: Callable[[], int]) -> None:
+    def __init__(
+        self, store: Store, listening: Listening, port: Callable[[], int],
+        is_open: Callable[[int, str], bool] = lambda rater, page: False,
+    ) -> None:  # fmt: skip
         self._store = store
         self._listening = listening
-        self._port = port
+        self._is_open = is_open
+        self.sessions = Sessions(store, listening, port)
         self.offences = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
         """Of each sender: wrong links, and requests that no browser sends."""
 
@@ -85,8 +85,11 @@ class AccessControl:
         table = tuple(routes)
         self._least = {route.handler: _RANK.get(route.role, 0) for route in table}
         self._audited = {route.handler: route.audit for route in table if route.audit}
+        self._unnamed = {route.handler for route in table if not route.names_page}
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
-        app.add_routes([web.route(route.method, route.path, route.handler) for route in table])
+        # Without the base path, too: some proxies take it off, and a health check need not know it.
+        for base in {"", self._listening.base_path}:
+            app.add_routes([web.route(route.method, base + route.path, route.handler) for route in table])
         return app
 
     @web.middleware
@@ -110,7 +113,7 @@ class AccessControl:
             )
         if request.method not in ("GET", "POST"):  # aiohttp answers HEAD by GET, which would open links
             raise web.HTTPMethodNotAllowed(request.method, ["GET", "POST"])
-        await self._recognise(request)
+        await self.sessions.recognise(request)
         have = _RANK.get(request[RATER].role, 0) if RATER in request else 0
         # An address that does not exist is no secret, but strangers are not told which ones do.
         unknown = request.match_info.http_exception is not None
@@ -121,40 +124,27 @@ class AccessControl:
             if have == 0:
                 return self._login_page(401)
             raise web.HTTPForbidden(text="Only researchers may do that.")
-        if request.method == "POST" and not same_origin(request):
-            raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        if request.method == "POST":
+            self._check_page(request)
         if what := self._audited.get(request.match_info.handler):
             detail = request.query_string
-            await asyncio.to_thread(self._store.audit.add, request[RATER].name, what, detail)
+            await asyncio.to_thread(self._store.audit.note, request[RATER].name, what, detail)
         return await handler(request)
 
-    async def _recognise(self, request: web.Request) -> None:
-        """Notes who asks. One browser may hold sessions of several raters, each with its own tabs."""
-        known: list[tuple[Rater, str]] = []
-        for token in self._tokens(request):
-            digest = hash_token(token)
-            rater = await asyncio.to_thread(self._store.accounts.rater_of, digest, "session")
-            if rater is not None:
-                known.append((rater, digest))
-        if "rater" in request.match_info:  # the page, and its WebSocket, of this rater alone
-            wanted = int(request.match_info["rater"])
-            known = [(rater, digest) for rater, digest in known if rater.id == wanted]
-        # Elsewhere the most that any of the sessions may do.
-        known.sort(key=lambda entry: entry[0].role != "researcher")
-        if known:
-            request[RATER], request[SESSION] = known[0]
-
-    def _tokens(self, request: web.Request) -> list[str]:
-        prefix = self._cookie("")
-        return [value for name, value in request.cookies.items() if name.startswith(prefix)][:_MOST_SESSIONS]
-
-    def _cookie(self, rater: int | str) -> str:
-        # Browsers share cookies between the ports of a host; two studies on one machine must not.
-        return f"onedemo-{self._port()}-{rater}"
+    def _check_page(self, request: web.Request) -> None:
+        if not same_origin(request):
+            raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        if request.match_info.handler in self._unnamed:
+            return
+        page = request.headers.get(PAGE_HEADER, "")
+        if not page:
+            raise web.HTTPForbidden(text=f"This is done from a page, which names itself in {PAGE_HEADER}.")
+        if not self._is_open(request[RATER].id, page):
+            raise web.HTTPConflict(text="This page had lost its connection. Please try again in a moment.")
 
     def _login_page(self, status: int, note: str = "", token: str = "") -> web.Response:
         """What to do without a session; with a token, the button that opens its link."""
-        html = render("login.html", note=note, token=token, days=SESSION_DAYS)
+        html = render("login.html", base=self._listening.base_path, note=note, token=token, days=SESSION_DAYS)
         return web.Response(text=html, content_type="text/html", status=status)
 
     async def log_in(self, request: web.Request) -> web.StreamResponse:
@@ -174,6 +164,10 @@ class AccessControl:
             return response
         return await self._open(request, token, link)
 
+    async def signed_out(self, request: web.Request) -> web.Response:
+        """What is seen after signing out."""
+        return self._login_page(200, "You are signed out: nobody can go on with your page in this browser.")
+
     async def press_button(self, request: web.Request) -> web.StreamResponse:
         """Opens the link of the page with the button."""
         if request.content_type != "application/x-www-form-urlencoded":
@@ -187,43 +181,43 @@ class AccessControl:
         return await self._open(request, token, link)
 
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
-        session = new_session_token()
         opened = None
         if link is not None:
+            session = await self._session_of(request, link) or new_session_token()
             opened = await asyncio.to_thread(
                 self._store.accounts.open_link, hash_token(token), hash_token(session)
             )
         if opened is None:
             return await self._refuse(request, token, link)
-        await asyncio.to_thread(self._store.audit.add, opened.rater.name, "signed in", f"link {opened.id}")
-        response = web.HTTPSeeOther(f"/r/{opened.rater.id}")
-        # Lax, not Strict: a link is opened from a mail or a chat, and the redirect must carry it.
-        response.set_cookie(
-            self._cookie(opened.rater.id),
-            session,
-            max_age=SESSION_DAYS * 86400,
-            httponly=True,
-            samesite="Lax",
-            secure=self._listening.encrypted(request),
-            path="/",
-        )
+        await asyncio.to_thread(self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}")
+        response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id))
+        self.sessions.put(request, response, opened.rater.id, session)
         return response
+
+    async def _session_of(self, request: web.Request, link: Link) -> str | None:
+        """The session that this browser has by that link already, as far as the request tells."""
+        for token in self.sessions.tokens(request):
+            if await asyncio.to_thread(self._store.accounts.link_of_session, hash_token(token)) == link.id:
+                return token
+        return None
 
     async def _refuse(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
         if not self.offences[self._listening.sender(request)].take():  # of links that open, none is refused
             return self._login_page(429, _REFUSED["too many"])
         address = self._listening.client(request)
         why = "unknown" if link is None else link.state
-        await asyncio.to_thread(self._store.audit.add, address, "sign-in refused", f"{why} link")
+        await asyncio.to_thread(
+            self._store.audit.note, address, "sign-in refused", f"{why} link", stranger=True
+        )
         if link is None:
             return self._login_page(403, _REFUSED["unknown"])
-        if link.state in ("used", "expired"):  # clicked again in the browser that it let in
-            for session in self._tokens(request):
-                if (
-                    await asyncio.to_thread(self._store.accounts.link_of_session, hash_token(session))
-                    == link.id
-                ):
-                    raise web.HTTPSeeOther(f"/r/{link.rater.id}")
+        if link.state in ("used", "expired") and request.method == "GET":
+            # Clicked again in the browser that it let in? The person's own cookie is sent below /r/N alone.
+            if "rater" not in request.match_info:
+                page = self._listening.page_path(link.rater.id)
+                raise web.HTTPSeeOther(f"{page}login?{request.query_string}")
+            if await self._session_of(request, link) is not None:
+                raise web.HTTPSeeOther(self._listening.page_path(link.rater.id))
         # Read anew: of two who press at once, one finds it used.
         now = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         assert now is not None

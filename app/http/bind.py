@@ -14,6 +14,8 @@ from onedemo.errors import UserError
 
 _HOST_NAME = re.compile(r"(?=.{1,253}$)[a-z0-9]([a-z0-9-]*[a-z0-9])?(\.[a-z0-9]([a-z0-9-]*[a-z0-9])?)*")
 
+_BASE_PATH = re.compile(r"(?=.{0,100}$)(/[A-Za-z0-9_-]+)*")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Listening:
@@ -36,6 +38,8 @@ class Listening:
     who asks (the last of X-Forwarded-For) and how (X-Forwarded-Proto)."""
     names: tuple[str, ...] = ()
     """Host names that people use, besides this machine's numbers and localhost."""
+    base_path: str = ""
+    """What all addresses begin with, such as /study1, where a proxy gives the study a path alone."""
 
     def __post_init__(self) -> None:
         if (self.tls_cert is None) != (self.tls_key is None):
@@ -50,6 +54,11 @@ class Listening:
                 raise UserError(
                     f"--allow-host takes a host name such as study.example.org, got {name[:80]!a}"
                 )
+        if not _BASE_PATH.fullmatch(self.base_path):
+            raise UserError(
+                f"--base-path takes a path such as /study1, of letters, digits, - and _, "
+                f"got {self.base_path[:80]!a}"
+            )
 
     def ssl_context(self) -> ssl.SSLContext | None:
         """What encrypts; None if nothing does.
@@ -67,6 +76,23 @@ class Listening:
                 f"cannot use the certificate {self.tls_cert} with the key {self.tls_key}: {error}"
             ) from None
         return context
+
+    def address(self, port: int) -> str:
+        """Where people find the page: ``https://study.example.org/study1``, without a slash at its end.
+
+        Args:
+            port: That is open.
+        """
+        if self.behind_proxy and self.names:  # it is the proxy that people speak to
+            return f"https://{self.names[0]}{self.base_path}"
+        scheme, usual = ("https", 443) if self.tls_cert else ("http", 80)
+        host = "127.0.0.1" if self.host in ("", "0.0.0.0", "::") else self.host
+        host = self.names[0] if self.names else f"[{host}]" if ":" in host else host
+        return f"{scheme}://{host}{'' if port == usual else f':{port}'}{self.base_path}"
+
+    def page_path(self, rater: int) -> str:
+        """Path of a person's page; all that it uses lies below."""
+        return f"{self.base_path}/r/{rater}/"
 
     def knows(self, host: str) -> bool:
         """Whether a request may name this host: a number, localhost, or a name that was allowed.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Protocol
 
 from aiohttp import web
@@ -69,7 +69,7 @@ class Files:
 
     async def login_static(self, request: web.Request) -> web.StreamResponse:
         """A file of ours that the login page needs."""
-        path = assets.STATIC / request.path.removeprefix("/static/")
+        path = assets.STATIC / PurePosixPath(request.path).name
         return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
 
     async def clip(self, request: web.Request) -> web.StreamResponse:

@@ -23,7 +23,7 @@ from aiohttp import web
 from onedemo.app.annotation.presses import PageGone, Press, read_press
 from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.http import assets
-from onedemo.app.http.auth import RATER, SECURITY_HEADERS, AccessControl, Route
+from onedemo.app.http.auth import SECURITY_HEADERS, AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.commands import Actions
 from onedemo.app.http.connections import Connections, Limits, raise_descriptors
@@ -39,6 +39,7 @@ from onedemo.app.http.rate_limit import (
     Places,
 )
 from onedemo.app.http.refusals import Refusals, read_body, read_json
+from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.services.demo_images import Pictures
@@ -81,6 +82,10 @@ class Inside(Protocol):
         """Carries out what somebody pressed; whether it counted."""
         ...
 
+    def is_open(self, rater_id: int, token: str) -> bool:
+        """Whether somebody has a page of that name open."""
+        ...
+
 
 def check_port(host: str, port: int) -> None:
     """Raises UserError if the port cannot be opened now; to be called before anything is written."""
@@ -112,7 +117,7 @@ class Front:
         self._files = Files(page)
         self._downloads = Downloads(store, SECURITY_HEADERS)
         self._uploads = Uploads(store.path.parent)
-        self._access = AccessControl(store, listening, lambda: self._port)
+        self._access = AccessControl(store, listening, lambda: self._port, page.is_open)
         self._refusals = Refusals(listening, self._access.offences, _person)
         limits = Limits.of(raise_descriptors(), addresses_known=not listening.behind_proxy)
         self._connections = Connections(limits, addresses_known=not listening.behind_proxy)
@@ -125,7 +130,7 @@ class Front:
         self._pressed = Places(PRESSES_WAITING, PRESSES_WAITING_EACH)
         self._acted = Places(ACTIONS_WAITING, ACTIONS_WAITING)
         self._health_asked: asyncio.Future[Status] | None = None
-        self._html = assets.page_html()
+        self._html, self._policy = assets.page_html(), assets.page_policy()
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._thread: threading.Thread | None = None
@@ -137,16 +142,9 @@ class Front:
 
     def routes(self) -> tuple[Route, ...]:
         """All there is, each with the least role that it asks for."""
-        files, downloads = self._files, self._downloads
-        return (
-            Route("GET", "/login", "stranger", self._access.log_in),
-            Route("POST", "/login", "stranger", self._access.press_button),
-            Route("GET", "/healthz", "stranger", self._health),
-            *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
-            Route("GET", "/", "annotator", self._home),
-            Route("GET", r"/r/{rater:\d{1,9}}", "annotator", self._page_of),
-            Route("POST", r"/r/{rater:\d{1,9}}/press", "annotator", self._press),
-            Route("POST", r"/r/{rater:\d{1,9}}/do", "researcher", self._do),
+        files, downloads, sessions = self._files, self._downloads, self._access.sessions
+        # The page asks for these below its person; programs may leave the person out.
+        either = (
             Route("GET", "/static/{name}", "annotator", files.static),
             Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
             Route("GET", r"/pairs/{pair:\d{1,15}}.jpg", "annotator", files.pair),
@@ -160,6 +158,26 @@ class Front:
             Route("GET", "/card.md", "researcher", downloads.card, "downloaded the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
             Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),
+        )
+        return (
+            Route("GET", "/login", "stranger", self._access.log_in),
+            Route("GET", PERSON + "/login", "stranger", self._access.log_in),
+            Route("POST", "/login", "stranger", self._access.press_button, names_page=False),
+            Route("GET", "/signed-out", "stranger", self._access.signed_out),
+            Route("GET", "/healthz", "stranger", self._health),
+            *(
+                Route("GET", f"/static/{name}", "stranger", files.login_static)
+                for name in sorted(assets.PUBLIC)
+            ),
+            Route("GET", "/", "annotator", self._home),
+            Route("GET", PERSON, "annotator", self._page_of),
+            Route("GET", PERSON + "/", "annotator", self._page_of),
+            Route("GET", PERSON + "/session", "stranger", sessions.state),
+            Route("POST", PERSON + "/signout", "annotator", sessions.sign_out),
+            Route("POST", PERSON + "/press", "annotator", self._press, names_page=False),
+            Route("POST", PERSON + "/do", "researcher", self._do),
+            *either,
+            *(route._replace(path=PERSON + route.path) for route in either),
         )
 
     def start(self) -> str:
@@ -178,9 +196,7 @@ class Front:
         if failure:
             self._thread.join()
             raise _explain(failure[0], self._host, self._port) from None
-        shown = "127.0.0.1" if self._host in ("", "0.0.0.0", "::") else self._host
-        scheme = "http" if self._tls is None else "https"
-        return f"{scheme}://{f'[{shown}]' if ':' in shown else shown}:{self._port}"
+        return self._listening.address(self._port)
 
     def close(self) -> None:
         """Closes the port and every connection."""
@@ -242,12 +258,18 @@ class Front:
     # What is nobody else's
 
     async def _home(self, request: web.Request) -> web.StreamResponse:
-        raise web.HTTPSeeOther(f"/r/{request[RATER].id}")
+        raise web.HTTPSeeOther(self._listening.page_path(request[RATER].id))
 
     async def _page_of(self, request: web.Request) -> web.StreamResponse:
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._proxy.socket(request)
-        return web.Response(text=self._html, content_type="text/html")
+        # Viser's client does what a query tells it, such as to show a recording from elsewhere. And the
+        # addresses in the page hold only below the person.
+        if request.query_string or not request.path.endswith("/"):
+            raise web.HTTPSeeOther(self._listening.page_path(request[RATER].id))
+        self._proxy.expect(request)
+        headers = {"Content-Security-Policy": self._policy}
+        return web.Response(text=self._html, content_type="text/html", headers=headers)
 
     async def _health(self, request: web.Request) -> web.Response:
         try:

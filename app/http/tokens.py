@@ -14,12 +14,15 @@ import secrets
 from datetime import timedelta
 from pathlib import Path
 
+from onedemo.core.files import write_atomic
 from onedemo.errors import UserError
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 
 SECRET_FILE = "link-secret"
 SECRET_BYTES = 32
+ADDRESS_FILE = "address"
+_USUAL_ADDRESS = "http://127.0.0.1:8080"
 _UNITS = {"m": timedelta(minutes=1), "h": timedelta(hours=1), "d": timedelta(days=1)}
 
 
@@ -99,6 +102,19 @@ def passing_link(
     token = new_session_token()
     store.accounts.add_token(hash_token(token), rater.id, "link", once=once, lasts=lasts)
     return f"{base_url.rstrip('/')}/login?token={token}"
+
+
+def write_address(data_dir: Path, url: str) -> None:
+    """Leaves the address of the server in the data directory, for links that another process makes."""
+    write_atomic(Path(data_dir) / ADDRESS_FILE, f"{url}\n".encode())
+
+
+def read_address(data_dir: Path) -> str:
+    """Where the server of a data directory is, or was last; where one is by default if there was none."""
+    try:
+        return (Path(data_dir) / ADDRESS_FILE).read_text().strip() or _USUAL_ADDRESS
+    except FileNotFoundError:
+        return _USUAL_ADDRESS
 
 
 def read_span(text: str) -> timedelta:

@@ -1,13 +1,16 @@
 """The WebSocket of a page, passed on to Viser, which listens on the loopback only.
 
-Viser serves nothing else that a browser needs, so nothing else is passed on.
+Viser serves nothing else that a browser needs, so nothing else is passed on. A proxy before this server may
+not pass it on, or not as it came: then nothing happens in the browser, and the log says what is wrong.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 import sqlite3
+import time
 from typing import Protocol
 
 from aiohttp import (
@@ -20,7 +23,7 @@ from aiohttp import (
     web,
 )
 
-from onedemo.app.http.auth import RATER, SESSION, same_origin
+from onedemo.app.http.auth import same_origin
 from onedemo.app.http.connections import Connection
 from onedemo.app.http.rate_limit import (
     BYTES_AT_ONCE,
@@ -33,8 +36,12 @@ from onedemo.app.http.rate_limit import (
     Bucket,
     Places,
 )
+from onedemo.app.http.sessions import RATER, SESSION
 from onedemo.app.http.viser_protocol import known
 from onedemo.storage.store import Store
+from onedemo.types import Rater
+
+log = logging.getLogger("onedemo.page")
 
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"
@@ -46,6 +53,13 @@ _CLOSE_S = 2.0
 """What a browser has to answer that its page is closed."""
 _LOOK_S = 1.0
 """How soon a page is closed whose session has ended."""
+_NOTE_USE_S = 600.0
+"""How often it is noted that a session is in use."""
+_FOLLOWED_S = 20.0
+"""Within this time a page opens its socket."""
+_MOST_WARNINGS = 20
+"""Of each kind."""
+_PROXY = "a proxy before this server must pass on WebSockets and the Host header; see `onedemo proxy nginx`"
 
 
 class Behind(Protocol):
@@ -69,6 +83,9 @@ class Proxy:
         self._sockets: dict[web.WebSocketResponse, str] = {}
         """Each open page, with the session it belongs to."""
         self._places = Places(most_pages, MOST_PAGES_EACH)
+        self._followed: set[str] = set()
+        """Sessions whose page has opened a socket."""
+        self._warned: dict[str, set[str]] = {}
         self._upstream: ClientSession | None = None
         self._watching: asyncio.Task[None] | None = None
 
@@ -90,13 +107,41 @@ class Proxy:
     async def socket(self, request: web.Request) -> web.StreamResponse:
         """Joins a browser's socket to one of Viser's until either ends or the session is revoked."""
         if not same_origin(request):
+            origin = request.headers.get("Origin", "none")[:200]
+            self._warn(
+                "origin", f"{origin} {request.host}",
+                "a page was refused its connection: it came from %a, and was asked for at %a; " + _PROXY,
+                origin, request.host,
+            )  # fmt: skip
             raise web.HTTPForbidden(text="This page can only be used from its own address.")
+        self._followed.add(request[SESSION])
         with self._places.one(request[RATER].id) as free:
             if not free:
                 raise web.HTTPServiceUnavailable(
                     text="Too many pages are open. Close some and reload this one."
                 )
             return await self._join(request)
+
+    def expect(self, request: web.Request) -> None:
+        """Notes that a page was given to a browser, and warns unless it opens its socket."""
+        asyncio.get_running_loop().call_later(
+            _FOLLOWED_S, self._look_for_socket, request[RATER], request[SESSION]
+        )
+
+    def _look_for_socket(self, rater: Rater, session: str) -> None:
+        if session not in self._followed:
+            self._warn(
+                "socket", rater.name,
+                "the page of %s was opened, and its connection did not come within %d s; " + _PROXY,
+                rater.name, _FOLLOWED_S,
+            )  # fmt: skip
+
+    def _warn(self, kind: str, what: str, text: str, *values: object) -> None:
+        """Logs something once, and so many such things in all: strangers cause them."""
+        warned = self._warned.setdefault(kind, set())
+        if what not in warned and len(warned) < _MOST_WARNINGS:
+            warned.add(what)
+            log.warning(text, *values)
 
     async def _join(self, request: web.Request) -> web.StreamResponse:
         assert self._upstream is not None
@@ -138,18 +183,23 @@ class Proxy:
         return outside
 
     async def _end_sessions(self) -> None:
-        """Closes pages whose session was revoked or has expired."""
+        """Closes pages whose session was revoked, signed out or has expired; notes use of the others."""
+        noted: dict[str, float] = {}
         while True:
             await asyncio.sleep(_LOOK_S)
+            sessions, now = set(self._sockets.values()), time.monotonic()
+            noted = {session: at for session, at in noted.items() if at > now - _NOTE_USE_S}
             try:
-                ended = await asyncio.to_thread(
-                    self._store.accounts.ended_sessions, set(self._sockets.values())
-                )
+                ended = await asyncio.to_thread(self._store.accounts.ended_sessions, sessions)
+                if used := sessions - ended - noted.keys():
+                    await asyncio.to_thread(self._store.accounts.note_use, used)
+                await asyncio.to_thread(self._store.audit.finish)
             except sqlite3.Error:  # locked, say: it is looked at again
                 continue
+            noted |= dict.fromkeys(used, now)
             for browser, session in tuple(self._sockets.items()):
                 if session in ended:
-                    await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this link was revoked")
+                    await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this session has ended")
 
 
 async def _pump(inside: ClientWebSocketResponse, outside: web.WebSocketResponse) -> None:

@@ -108,15 +108,22 @@ class Page:
             PageGone: If no page of the rater goes by that name.
             AnsweredElsewhere, ValueError, sqlite3.Error: As ``Session.press``.
         """
-        with self._lock:
-            sessions = list(self._sessions.values())
-        for session in sessions:
-            if session.token == press.page and session.rater.id == rater_id:
-                return session.press(press)
+        if session := self._open(rater_id, press.page):
+            return session.press(press)
         raise PageGone(
             "This page had lost its connection. Look at the clip that is shown now: "
             "your last answer may have been saved."
         )
+
+    def is_open(self, rater_id: int, token: str) -> bool:
+        """Whether a rater has a page of that name open."""
+        return self._open(rater_id, token) is not None
+
+    def _open(self, rater_id: int, token: str) -> Session | None:
+        with self._lock:
+            sessions = list(self._sessions.values())
+        named = (s for s in sessions if s.token == token and s.rater.id == rater_id)
+        return next(named, None)
 
     # One session per browser
 

@@ -7,7 +7,7 @@ from onedemo.app.templates import render
 
 def example_address(name: str, sha256: str) -> str:
     """Where an example from a demo is; another demo's are elsewhere, as browsers keep them."""
-    return f"/demo/examples/{name}.jpg?v={sha256[:8]}"
+    return f"demo/examples/{name}.jpg?v={sha256[:8]}"
 
 
 def player_html(source: str, fps: float, *sides: str) -> str:

@@ -85,4 +85,4 @@ class Compare(Pressing):
             self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))
 
     def _address(self, pair: int | None) -> str | None:
-        return f"/pairs/{pair}.jpg?v={self._context.version}" if pair is not None else None
+        return f"pairs/{pair}.jpg?v={self._context.version}" if pair is not None else None

@@ -145,7 +145,7 @@ class Rate(Pressing):
         self._show_answers(lesson.answer is None)
 
     def _address(self, clip: int | None) -> str | None:
-        return f"/clips/{clip}.jpg?v={self._context.version}" if clip is not None else None
+        return f"clips/{clip}.jpg?v={self._context.version}" if clip is not None else None
 
     def _show_answers(self, visible: bool) -> None:
         if self._answering.visible != visible:

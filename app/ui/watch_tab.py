@@ -197,7 +197,7 @@ def frame_html(frame: int, sha256: str) -> Markup:
 
 def frame_address(frame: int, sha256: str) -> str:
     """Where a frame of a demo is; another demo's are elsewhere, as browsers keep them."""
-    return f"/demo/frames/{frame}.jpg?v={sha256[:8]}"
+    return f"demo/frames/{frame}.jpg?v={sha256[:8]}"
 
 
 def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> Markup:

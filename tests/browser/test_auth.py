@@ -64,11 +64,11 @@ def test_hosts_that_may_be_named(host, fine):
     assert Listening(names=("study.example.org",)).knows(host) == fine
 
 
-def ask(url, path="/login", **options):
+def ask(url, path="/login", *, follow=False, **options):
     async def go():
         async with aiohttp.ClientSession() as session:
             method = options.pop("method", "GET")
-            async with session.request(method, url + path, allow_redirects=False, **options) as response:
+            async with session.request(method, url + path, allow_redirects=follow, **options) as response:
                 return response.status, response.headers, await response.text()
 
     return run(go())
@@ -147,7 +147,7 @@ def test_a_link_that_opens_once_opens_once_and_for_nobody_who_only_looks(site):
     assert status == 303 and "HttpOnly" in headers["Set-Cookie"]
     status, headers, text = ask(site.url, "/login", method="POST", data={"token": token}, headers=own)
     assert status == 403 and "was used already" in text and "Set-Cookie" not in headers
-    assert "was used already" in ask(site.url, link)[2]
+    assert "was used already" in ask(site.url, link, follow=True)[2]
 
 
 @pytest.mark.seam
@@ -159,7 +159,7 @@ def test_a_link_ends_when_its_time_is_over(site):
     with closing(sqlite3.connect(store.path)) as db:  # the minute has gone by
         db.execute("UPDATE tokens SET expires_at = '2020-01-01T00:00:00.000Z' WHERE kind = 'link'")
         db.commit()
-    status, _, text = ask(site.url, link)
+    status, _, text = ask(site.url, link, follow=True)
     assert status == 403 and "time of this link is over" in text
     state = {link.rater.name: link.state for link in store.accounts.links()}
     assert state["bo"] == "expired"
@@ -252,7 +252,7 @@ def test_wrong_links_are_tried_only_so_often(site):
     assert set(said[WRONG_LINKS_AT_ONCE:-1]) == {429}
     assert said[-1] == 303  # others at that address have links that work
     refused = [line for line in site.trainer.store.audit.lines() if line[2] == "sign-in refused"]
-    assert len(refused) == WRONG_LINKS_AT_ONCE  # a flood does not fill the log
+    assert len(refused) == 1  # a flood does not fill the log
 
 
 # What may be said
@@ -464,11 +464,11 @@ def test_what_researchers_do_is_in_the_log(site):
             )
             for path in exports:
                 await (await session.get(f"{site.url}/{path}")).read()
-            await session.post(f"{site.url}/r/1/do", json={"do": "exclude", "rater": 2})
-            await session.post(f"{site.url}/r/1/do", json={"do": "exclude", "rater": 99})
         async with browser_session() as session:
             tab = await open_tab(session, site.links["researcher"])
             await tab.until(lambda: "alt+P" in tab.keys, "keys")
+            for rater in (2, 99):
+                await tab.do(do="exclude", rater=rater)
             await tab.press("alt+P")
             await asyncio.sleep(0.5)
             await tab.close()
@@ -477,7 +477,7 @@ def test_what_researchers_do_is_in_the_log(site):
     lines = [(who, what, detail) for _, who, what, detail in site.trainer.store.audit.lines()]
     assert [line[1] for line in lines] == [
         "signed in", "downloaded ratings", "downloaded segments", "downloaded the data card",
-        "downloaded comparisons", "downloaded skips", "exclude", "signed in", "paused the run",
+        "downloaded comparisons", "downloaded skips", "exclude", "paused the run",
     ]  # fmt: skip
     assert {line[0] for line in lines} == {"ada"}
     assert lines[1][2] == "run=backflip-1" and lines[6][2] == "rater 2; run backflip-1"

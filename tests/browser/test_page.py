@@ -63,7 +63,7 @@ def shown_clip(page, guard_ms: int = GUARD_MS) -> int:
     page.wait_for_timeout(guard_ms)
     player = page.locator(".od-clip .od-player")
     clip = int(player.get_attribute("data-clip"))
-    assert player.get_attribute("data-src").startswith(f"/clips/{clip}.jpg?v=")
+    assert player.get_attribute("data-src").startswith(f"clips/{clip}.jpg?v=")
     assert len(set(drawn(page, "left"))) > 5
     return clip
 

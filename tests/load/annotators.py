@@ -24,7 +24,7 @@ import zstandard
 
 _PAGE = re.compile(r'data-page="([^"]+)"')
 _CLIP = re.compile(r'data-clip="(\d+)"')
-_AHEAD = re.compile(r'data-ahead="/clips/(\d+)\.jpg\b')
+_AHEAD = re.compile(r'data-ahead="clips/(\d+)\.jpg\b')
 _WAITING = 'class="od-waiting"'
 _SIZES = 16
 """Bytes before the compressed part of a message: its size when unpacked, and as it is."""
@@ -109,6 +109,12 @@ class Tab:
         headers = self.headers | {"Origin": self.base}
         async with self.session.post(f"{self.address}/press", json=body, headers=headers) as answer:
             return answer.status, await answer.text()
+
+    async def do(self, **action: object) -> int:
+        """Sends an action of a researcher, as a browser does; the status of the answer."""
+        headers = self.headers | {"Origin": self.base, "X-Onedemo-Page": self.token}
+        async with self.session.post(f"{self.address}/do", json=action, headers=headers) as answer:
+            return answer.status
 
     async def press(self, key: str) -> None:
         """Presses a key and waits for nothing.
@@ -200,7 +206,7 @@ class Tab:
         }
 
     async def _fetch(self, clip: int) -> None:
-        async with self.session.get(f"{self.base}/clips/{clip}.jpg", headers=self.headers) as answer:
+        async with self.session.get(f"{self.address}/clips/{clip}.jpg", headers=self.headers) as answer:
             answer.raise_for_status()
             await answer.read()
 
@@ -226,7 +232,7 @@ async def open_tab(session: aiohttp.ClientSession, link: str) -> Tab:
     socket = await session.ws_connect(
         page, headers=headers | {"Origin": base}, protocols=[f"viser-v{version('viser')}"], max_msg_size=0
     )
-    tab = Tab(base=base, address=page, session=session, socket=socket, headers=headers)
+    tab = Tab(base=base, address=page.rstrip("/"), session=session, socket=socket, headers=headers)
     await tab._say(_CAMERA)  # what makes Viser count the browser as connected
     return tab
 

@@ -84,10 +84,16 @@ EXAMPLES = {
     "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": "far", "iteration": "1", "suffix": "jpg",
 }  # fmt: skip
 """What the places in a route's path may be; the rater is the annotator."""
-STRANGERS_MAY = {"/login", "/healthz", "/static/login.css", "/static/icon.svg"}
-ANNOTATORS_MAY = {
-    "/", "/r/2", "/r/2/press", "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
-    "/demo/examples/far.jpg",
+STRANGERS_MAY = {
+    "/login", "/signed-out", "/healthz", "/static/login.css", "/static/icon.svg", "/r/2/login",
+    "/r/2/session",
+}  # fmt: skip
+ANNOTATORS_MAY = {"/", "/r/2", "/r/2/", "/r/2/press", "/r/2/signout"} | {
+    place + path
+    for path in (
+        "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg", "/demo/examples/far.jpg",
+    )
+    for place in ("", "/r/2")
 }  # fmt: skip
 
 
@@ -109,7 +115,7 @@ def status_of(url, method, path, link):
 def test_every_route_asks_for_its_role(site, role):
     """Which routes a role gets is written here once more: a new one must be added on purpose."""
     for route in site.front.routes():
-        path = "/static/page.css" if route.path == "/static/{name}" else route.path
+        path = route.path.replace("/static/{name}", "/static/page.css")
         for name, example in EXAMPLES.items():
             path = re.sub(rf"\{{{name}(:[^/]*?)?\}}(?=[./]|$)", example, path)
         if role == "researcher":
@@ -122,9 +128,10 @@ def test_every_route_asks_for_its_role(site, role):
         assert route.role == least, f"{path} asks for {route.role}"
         status = status_of(site.url, route.method, path, site.links.get(role))
         if least == "stranger" or role == "researcher" or role == least:
-            refused = (415,) if (route.method, path) == ("POST", "/login") else ()  # no form
+            # No form, no token in it, or no open page named; or nobody of whom to say whether they are in.
+            refused = (403, 415) if route.method == "POST" else (401,) if plain == "/r/2/session" else ()
             assert status in (200, 204, 303, 400, 404, *refused), f"{path} for a {role}: {status}"
-            assert status != 404 or path in ("/pairs/1.jpg", "/rollouts/1.jpg")
+            assert status != 404 or path.endswith(("/pairs/1.jpg", "/rollouts/1.jpg"))
         else:
             assert status == (401 if role == "stranger" else 403), f"{path} for a {role}"
 
@@ -156,13 +163,14 @@ def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
 
 def test_link_becomes_a_cookie_that_scripts_cannot_read(site):
     status, headers, _, _ = fetch(site.url, site.links["annotator"].removeprefix(site.url), follow=False)
-    assert (status, headers["Location"]) == (303, "/r/2")
-    cookie = headers["Set-Cookie"]
-    assert "HttpOnly" in cookie and "SameSite=Lax" in cookie
+    assert (status, headers["Location"]) == (303, "/r/2/")
+    cookies = headers.getall("Set-Cookie")
+    assert [re.search("Path=([^;]+)", cookie)[1] for cookie in cookies] == ["/r/2", "/"]
+    assert all("HttpOnly" in cookie and "SameSite=Lax" in cookie for cookie in cookies)
     assert headers["Referrer-Policy"] == "no-referrer"
     status, _, body, _ = fetch(site.url, "/", link=site.links["annotator"])
     assert status == 200
-    assert b"/static/page.css" in body and b"<title>onedemo</title>" in body
+    assert b'"static/page.css"' in body and b"<title>onedemo</title>" in body
 
 
 def test_unknown_and_revoked_links_are_refused_kindly(site):

@@ -9,7 +9,7 @@ from aiohttp import web
 
 from helpers.beside_playwright import run
 from onedemo.app.http import uploads
-from onedemo.app.http.auth import AccessControl, Route
+from onedemo.app.http.auth import PAGE_HEADER, AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.http.uploads import Uploads
@@ -37,7 +37,7 @@ def visit(store, what, *, role="researcher", **limits):
 
     async def go():
         port = 0
-        access = AccessControl(store, Listening(port=0), lambda: port)
+        access = AccessControl(store, Listening(port=0), lambda: port, lambda *_: True)
         taken = Uploads(store.path.parent, **limits)
         routes = [
             Route("GET", "/login", "stranger", access.log_in),
@@ -67,7 +67,8 @@ def send(store, content, *, origin=None, filename="../../evil.mp4", role="resear
         for name, value in ({"name": "kick"} | fields).items():
             form.add_field(name, value)
         form.add_field("video", content, filename=filename, content_type="video/mp4")
-        async with session.post(url + "/demos", data=form, headers={"Origin": origin or url}) as answer:
+        headers = {"Origin": origin or url, PAGE_HEADER: "a"}
+        async with session.post(url + "/demos", data=form, headers=headers) as answer:
             return answer.status, await answer.text()
 
     return visit(store, post, role=role, **(limits or {}))
@@ -143,7 +144,7 @@ async def begin(session, url, wait, video):
         part.set_content_disposition("form-data", name="name")
         part = form.append(slow(video, wait)())
         part.set_content_disposition("form-data", name="video", filename="a.mp4")
-    return await session.post(url + "/demos", data=form, headers={"Origin": url})
+    return await session.post(url + "/demos", data=form, headers={"Origin": url, PAGE_HEADER: "a"})
 
 
 def test_one_that_never_ends_is_given_up(store, video):

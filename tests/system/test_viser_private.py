@@ -21,7 +21,7 @@ def test_version_is_the_one_that_was_read():
 def test_html_has_the_places_where_ours_goes():
     html = assets.page_html()
     assert "<title>onedemo</title>" in html and "Viser</title>" not in html
-    assert html.index("/static/page.js") < html.index("data-p=")
+    assert html.index("static/page.js") < html.index("data-p=")
 
 
 def test_nobody_can_talk_to_the_server_as_a_whole(site):

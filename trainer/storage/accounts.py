@@ -5,6 +5,8 @@ Only hashes of tokens are kept: who reads the database cannot come in with what 
 
 from __future__ import annotations
 
+import sqlite3
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Literal
@@ -15,6 +17,10 @@ from onedemo.types import Rater
 
 SESSION_DAYS = 30
 """How long a cookie lets in."""
+MOST_SESSIONS = 100
+"""Of one link. A program that opens its link each time makes many; those longest unused end first."""
+_ENDED_DAYS = 7
+"""How long it is still known why a session ended."""
 
 # A time is compared as text: all are UTC in one form (onedemo.storage.database.now).
 _STATE = (
@@ -112,6 +118,8 @@ class Accounts:
     def open_link(self, token_hash: str, session_hash: str) -> Link | None:
         """Trades a link for a session; None if it does not open (any more). Of two at once, one may win.
 
+        A session that there is already lasts 30 days from now on.
+
         Args:
             token_hash: Of the link.
             session_hash: Of the session's token, which lasts 30 days.
@@ -122,8 +130,48 @@ class Accounts:
                 return None
             db.execute("UPDATE tokens SET last_used_at = ? WHERE id = ?", (now(), link.id))
             lasts = timedelta(days=SESSION_DAYS)
-            self.add_token(session_hash, link.rater.id, "session", lasts=lasts, link_id=link.id)
+            session = self.add_token(session_hash, link.rater.id, "session", lasts=lasts, link_id=link.id)
+            db.execute(
+                "UPDATE tokens SET expires_at = ?, last_used_at = ? WHERE id = ?",
+                (_in(lasts), now(), session),
+            )
+            self._purge(db, link)
         return link
+
+    def _purge(self, db: sqlite3.Connection, link: Link) -> None:
+        """Forgets sessions that ended long ago, and those of a link that are too many."""
+        db.execute(
+            "DELETE FROM tokens WHERE kind = 'session'"
+            " AND MIN(expires_at, COALESCE(revoked_at, expires_at)) <= ?",
+            (_in(-timedelta(days=_ENDED_DAYS)),),
+        )
+        db.execute(
+            "DELETE FROM tokens WHERE id IN ("
+            " SELECT id FROM tokens WHERE rater_id = ? AND kind = 'session' AND link_id = ?"
+            " ORDER BY COALESCE(last_used_at, created_at) DESC, id DESC LIMIT -1 OFFSET ?)",
+            (link.rater.id, link.id, MOST_SESSIONS),
+        )
+
+    def session_state(self, session_hash: str) -> Literal["open", "expired", "revoked"] | None:
+        """What has become of a session; None if it is not known, such as one that was signed out."""
+        rows = self._database.rows(
+            f"SELECT {_STATE} FROM tokens t WHERE t.hash = :hash AND t.kind = 'session'",
+            {"hash": session_hash, "now": now()},
+        )
+        return rows[0][0] if rows else None
+
+    def end_session(self, session_hash: str) -> None:
+        """Forgets a session: its person signed out."""
+        with self._database.transaction() as db:
+            db.execute("DELETE FROM tokens WHERE hash = ? AND kind = 'session'", (session_hash,))
+
+    def note_use(self, session_hashes: Iterable[str]) -> None:
+        """Notes that these sessions are in use, so that others of their links end before them."""
+        with self._database.transaction() as db:
+            db.executemany(
+                "UPDATE tokens SET last_used_at = ? WHERE hash = ? AND kind = 'session'",
+                [(now(), session) for session in session_hashes],
+            )
 
     def link_of_session(self, session_hash: str) -> int | None:
         """The number of the link by which a session that holds came, if that is known."""

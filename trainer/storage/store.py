@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import suppress
 from pathlib import Path
 
 from onedemo.storage.accounts import Accounts
@@ -32,4 +34,6 @@ class Store:
 
     def close(self) -> None:
         """Closes the database; nothing of the store can be used afterwards."""
+        with suppress(sqlite3.Error):  # it must be closed, whatever the disk is like
+            self.audit.finish(everything=True)
         self.database.close()
