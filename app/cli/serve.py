@@ -14,7 +14,7 @@ from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
-from onedemo.render.renderer import RenderThread
+from onedemo.render.drawing_process import DrawingProcess
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
 from onedemo.types import Demo
@@ -60,7 +60,7 @@ def serve(
     check_port(listening.host, listening.port)
     sys.setswitchinterval(_SWITCH_SECONDS)
     store = Store(data_dir)
-    renderer = RenderThread(at_once=False)  # the page says what is wrong
+    renderer = DrawingProcess()
     secret = read_secret(data_dir)
     wanted = config if explicit else None
     found = None if new_run else find_run(store, data_dir, demo, name=run, wanted=wanted)

@@ -21,7 +21,7 @@ from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import gymnasium
@@ -168,6 +168,14 @@ class Order(IntEnum):
     """A long job, which lets others go first between its pictures (``Renderer.between``)."""
 
 
+class Drawing(Protocol):
+    """Whatever draws: a ``RenderThread``, or a process of its own."""
+
+    def submit(self, job: Callable[[Renderer], T], order: Order = ...) -> Future[T]:
+        """As ``RenderThread.submit``."""
+        ...
+
+
 class RenderThread:
     """One renderer in a daemon thread of its own, for callers in any thread.
 
@@ -242,7 +250,7 @@ class RenderThread:
         self._jobs.put(_Entry(order, next(self._numbers), future, job))
 
     def _work(self) -> None:
-        give_way()  # before the driver starts threads of its own
+        give_way(_NICE)  # before the driver starts threads of its own
         try:
             while (entry := self._jobs.get()).order < _LAST:
                 self._do(entry)
@@ -281,6 +289,8 @@ class RenderThread:
 
 _LAST = max(Order) + 1
 _PATIENCE_S = 1.0
+_NICE = 5
+"""Behind the page, before practice: people wait for pictures."""
 
 
 @dataclass(frozen=True, slots=True, order=True)

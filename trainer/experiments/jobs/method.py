@@ -18,6 +18,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,9 @@ def method_job(
 
 def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
     """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
-    text = to_toml(run_config({"ratings": 350, "set": {}, **settings}, 0))
+    decides = asdict(run_config({"ratings": 350, "set": {}, **settings}, 0))
+    del decides["storage"]  # what a run leaves on the disk changes no result
+    text = to_toml(decides)
     return {"config": hashlib.sha256(text.encode()).hexdigest()[:10]}
 
 
