@@ -153,7 +153,11 @@ def main(descriptor: int) -> None:
         with turn, suppress(OSError):
             pipe.send_bytes(data)
 
-    with Connection(descriptor) as pipe, RenderThread(at_once=False) as drawing, suppress(EOFError, OSError):
+    with (
+        Connection(descriptor) as pipe,
+        RenderThread(at_once=False, exact=False) as drawing,
+        suppress(EOFError, OSError),
+    ):
         while data := pipe.recv_bytes():
             number, order, job = pickle.loads(data)
             drawing.submit(job, Order(order)).add_done_callback(lambda done, n=number: answer(n, done))
