@@ -148,8 +148,8 @@ def main(descriptor: int) -> None:
         error = drawn.exception()
         try:
             data = pickle.dumps((number, None if error else drawn.result(), error))
-        except Exception:  # what cannot be pickled is told in words
-            data = pickle.dumps((number, None, RuntimeError(in_words(error or TypeError("no result")))))
+        except Exception as unsent:  # what cannot be pickled is told in words
+            data = pickle.dumps((number, None, RuntimeError(in_words(error or unsent))))
         with turn, suppress(OSError):
             pipe.send_bytes(data)
 
