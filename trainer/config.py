@@ -45,6 +45,18 @@ class RolloutConfig:
             raise ValueError(f"rollouts.physics must be 'mujoco' or 'warp', got {self.physics!r}")
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StorageConfig:
+    """What a run leaves on the disk. No part of it changes what is learned."""
+
+    pictures_gb: float = 0.02
+    """Gigabytes of pictures that a run keeps: of what is answered or has expired, the newest that fit in
+    beside those that wait to be rated. The others are drawn again when somebody looks back at them."""
+
+    def __post_init__(self) -> None:
+        at_least("storage", self, pictures_gb=0)
+
+
 METHODS: dict[str, dict[str, Any]] = {
     "onedemo": {},
     "paper": {
@@ -86,6 +98,7 @@ class RunConfig:
     practice: PracticeConfig = field(default_factory=PracticeConfig)
     policy: PolicyConfig = field(default_factory=lambda: PolicyConfig(kind="table"))
     trpo: TrpoConfig = field(default_factory=TrpoConfig)
+    storage: StorageConfig = field(default_factory=StorageConfig)
 
     def __post_init__(self) -> None:
         one_of("method", self.method, METHODS)

@@ -16,7 +16,7 @@ from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig
 from onedemo.core.log_limit import limit_logs
 from onedemo.core.process import end_within
-from onedemo.render.renderer import RenderThread
+from onedemo.render.drawing_process import DrawingProcess
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
 from onedemo.types import Demo
@@ -65,7 +65,7 @@ def serve(
     sys.setswitchinterval(_SWITCH_SECONDS)
     limit_logs()
     store = Store(data_dir)
-    renderer = RenderThread(at_once=False)  # the page says what is wrong
+    renderer = DrawingProcess()
     secret = read_secret(data_dir)
     wanted = config if explicit else None
     found = None if new_run else find_run(store, data_dir, demo, name=run, wanted=wanted)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 from aiohttp import web
 
@@ -12,9 +14,14 @@ from onedemo.app.http import assets
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.storage.store import Store
+from onedemo.types import Clip
 
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Addresses of what differs between runs or demos end in ?v= and what they are of."""
+
+_KINDS = {".jpg": "image/jpeg", ".webm": "video/webm"}
+
+T = TypeVar("T")
 
 
 class Filmed(Protocol):
@@ -23,16 +30,16 @@ class Filmed(Protocol):
     store: Store
     run: str
 
-    def clip_file(self, clip_id: int) -> Path:
-        """The picture of a clip."""
+    def clip_picture(self, clip: Clip) -> Future[Path]:
+        """The future of the picture of a clip, which may have to be drawn."""
         ...
 
-    def pair_file(self, pair_id: int) -> Path:
-        """The picture of a pair."""
+    def pair_picture(self, pair_id: int) -> Future[Path]:
+        """The same of a pair."""
         ...
 
-    def rollout_file(self, iteration: int, suffix: str) -> Path:
-        """The best rollout of an iteration."""
+    def rollout_picture(self, iteration: int, suffix: str) -> Future[Path]:
+        """The same of the best rollout of an iteration; FileNotFoundError if there is none."""
         ...
 
 
@@ -59,6 +66,7 @@ class Files:
 
     def __init__(self, page: Shown) -> None:
         self._page = page
+        self._preparing = ThreadPoolExecutor(1, "demo-pictures")
 
     async def static(self, request: web.Request) -> web.StreamResponse:
         """A file of ours."""
@@ -79,7 +87,7 @@ class Files:
         clip = await asyncio.to_thread(trainer.store.clips.get, number)
         if clip is None or clip.run != trainer.run:
             raise web.HTTPNotFound()
-        return _jpeg(trainer.clip_file(number))
+        return await _file(trainer.clip_picture, clip)
 
     async def pair(self, request: web.Request) -> web.StreamResponse:
         """The picture of a pair."""
@@ -87,23 +95,16 @@ class Files:
         trainer = self._page.trainer
         if await asyncio.to_thread(trainer.store.comparisons.pair_run, number) != trainer.run:
             raise web.HTTPNotFound()
-        return _jpeg(trainer.pair_file(number))
+        return await _file(trainer.pair_picture, number)
 
     async def rollout(self, request: web.Request) -> web.StreamResponse:
         """The best rollout of an iteration: a picture, or the film."""
         iteration, suffix = int(request.match_info["iteration"]), request.match_info["suffix"]
-        try:
-            path = await asyncio.to_thread(self._page.trainer.rollout_file, iteration, suffix)
-        except FileNotFoundError:
-            raise web.HTTPNotFound() from None
-        except UserError as error:  # nothing can be drawn here
-            raise web.HTTPServiceUnavailable(text=str(error)) from None
-        kind = {"jpg": "image/jpeg", "webm": "video/webm"}[suffix]
-        return web.FileResponse(path, headers=_KEEP | {"Content-Type": kind})
+        return await _file(self._page.trainer.rollout_picture, iteration, suffix)
 
     async def demo_frame(self, request: web.Request) -> web.StreamResponse:
         """A frame of the demo."""
-        frames = await asyncio.to_thread(self._page.pictures.frames)
+        frames = await self._of_demo(Pictures.frames)
         index = int(request.match_info["index"])
         if index >= len(frames):
             raise web.HTTPNotFound()
@@ -111,14 +112,24 @@ class Files:
 
     async def demo_example(self, request: web.Request) -> web.StreamResponse:
         """A clip of the guide."""
-        examples = await asyncio.to_thread(self._page.pictures.examples)
+        examples = await self._of_demo(Pictures.examples)
         example = examples.get(request.match_info["name"])
         if example is None:
             raise web.HTTPNotFound()
         return web.Response(body=example, content_type="image/jpeg", headers=_KEEP)
 
+    async def _of_demo(self, what: Callable[[Pictures], T]) -> T:
+        """Made on first use, which takes seconds, by one thread however many pages ask."""
+        return await asyncio.get_running_loop().run_in_executor(self._preparing, what, self._page.pictures)
 
-def _jpeg(path: Path) -> web.FileResponse:
-    if not path.is_file():
-        raise web.HTTPNotFound()
-    return web.FileResponse(path, headers=_KEEP | {"Content-Type": "image/jpeg"})
+
+async def _file(ask: Callable[..., Future[Path]], *what: Any) -> web.FileResponse:
+    """A picture once it is there. Whoever waits for it holds no thread: others need those to rate."""
+    try:
+        coming = await asyncio.to_thread(ask, *what)
+        path = await asyncio.shield(asyncio.wrap_future(coming))  # others may wait for the same
+    except (FileNotFoundError, KeyError):
+        raise web.HTTPNotFound() from None
+    except UserError as error:  # nothing can be drawn here
+        raise web.HTTPServiceUnavailable(text=str(error)) from None
+    return web.FileResponse(path, headers=_KEEP | {"Content-Type": _KINDS[path.suffix]})

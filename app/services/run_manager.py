@@ -14,7 +14,7 @@ from onedemo.core.files import hold
 from onedemo.core.log_limit import LogLimit
 from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
-from onedemo.render.renderer import RenderThread
+from onedemo.render.renderer import Drawing
 from onedemo.reward.model import Snapshot, check_start
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.run_directory import RunDirectory
@@ -42,7 +42,7 @@ class Study:
     """Of the run that is served."""
 
     def __init__(
-        self, store: Store, data_dir: Path, renderer: RenderThread, *, encoder_weights: Path | None = None,
+        self, store: Store, data_dir: Path, renderer: Drawing, *, encoder_weights: Path | None = None,
         device: str = "cpu", served: Callable[[Trainer], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._store, self._data_dir, self._renderer = store, data_dir, renderer
@@ -132,11 +132,11 @@ class Study:
         self._release()
 
     def _switch(self, run: str, demo: Demo, config: RunConfig, *, start: Path | None = None) -> None:
-        self.trainer.retire()
+        worked = self.trainer.retire()
         try:
             self.serve(run, demo, config, start=start)
         except BaseException:
-            self.trainer.start()
+            self.trainer.readmit(start=worked)
             raise
         self.trainer.start()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 from onedemo.rl.rollouts import Acting, EpisodeRules
 from onedemo.storage.clips import NewClip
 from onedemo.storage.store import Store
-from onedemo.types import Demo, Segment, Status
+from onedemo.types import Clip, Demo, Segment, Status
 
 FPS = 30.0
 SIZE = (360, 480)
@@ -110,6 +111,12 @@ class StandIn:
     def clip_file(self, clip_id: int) -> Path:
         return self.directory / f"{clip_id:06d}.jpg"
 
+    def clip_picture(self, clip: Clip) -> Future[Path]:
+        return _there(self.clip_file(clip.id))
+
+    def pair_picture(self, pair_id: int) -> Future[Path]:
+        return _there(self.pair_file(pair_id))
+
     def want_pairs(self) -> None:
         self.calls.append("pairs")
 
@@ -126,7 +133,7 @@ class StandIn:
         self.store.comparisons.set_pair_state(ids, "ready")
         return ids
 
-    def rollout_file(self, iteration: int, suffix: str) -> Path:
+    def rollout_picture(self, iteration: int, suffix: str) -> Future[Path]:
         from onedemo.demos.video import write_webm
 
         if not 1 <= iteration <= len(self.store.runs.iterations(self.run)):
@@ -138,7 +145,7 @@ class StandIn:
             cv2.imwrite(str(file), np.concatenate(drawn_frames(6, phase=iteration), axis=1)[::3, ::3])
         else:
             write_webm(file, drawn_frames(30, phase=iteration), fps=FPS)
-        return file
+        return _there(file)
 
     def acting(self) -> Acting:
         return Acting(policy=Wobble(), rules=EpisodeRules())  # type: ignore[arg-type]
@@ -154,6 +161,12 @@ class StandIn:
     def stop(self) -> None:
         self.calls.append("stop")
         self.set_status(phase="stopped")
+
+
+def _there(file: Path) -> Future[Path]:
+    future: Future[Path] = Future()
+    future.set_result(file)
+    return future
 
 
 def _zeros() -> Segment:

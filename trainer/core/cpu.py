@@ -17,12 +17,15 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def give_way() -> None:
+def give_way(steps: int = _STEPS) -> None:
     """Lowers the priority of the calling thread, and of all threads that it starts from now on.
 
     So called before MuJoCo and torch make their pools. Only Linux has priorities of single threads;
     elsewhere nothing happens.
+
+    Args:
+        steps: How far, on the scale of ``nice``.
     """
     if sys.platform == "linux":
         thread = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + _STEPS)
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + steps)

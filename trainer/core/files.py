@@ -19,28 +19,30 @@ from onedemo.errors import UserError
 log = logging.getLogger("onedemo")
 
 
-def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
+def write_atomic(path: Path, data: bytes | Iterable[bytes], *, sync: bool = True) -> None:
     """Writes a file to a temporary name, syncs and renames it: a reader never sees half of it.
 
     Args:
         path: Where; missing directories are made.
         data: The whole content, in one piece or in several.
+        sync: As ``replacing``.
 
     Raises:
         OSError: If the disk is full or the directory not writable; the old file is then untouched.
     """
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with replacing(path, sync=sync) as temporary, temporary.open("wb") as file:
         for block in (data,) if isinstance(data, bytes) else data:
             file.write(block)
 
 
 @contextmanager
-def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
+def replacing(path: Path, suffix: str = "", *, sync: bool = True) -> Iterator[Path]:
     """A temporary name for a file that is written by others: synced and renamed when the block ends well.
 
     Args:
         path: Where; missing directories are made.
         suffix: What the temporary name ends in, for writers that go by it.
+        sync: Whether it must survive a power cut; False for what can be made again and has a checksum.
 
     Raises:
         OSError: As ``write_atomic``.
@@ -51,13 +53,16 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
     try:
         os.fchmod(handle, 0o666 & ~umask())  # mkstemp makes files that nobody else can read
         yield temporary
-        os.fsync(handle)
+        if sync:
+            os.fsync(handle)
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     finally:
         os.close(handle)
+    if not sync:
+        return
     directory = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(directory)  # the rename itself must survive a power cut

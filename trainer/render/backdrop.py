@@ -11,7 +11,9 @@ robot's track, y away from the camera, z up, in metres. The camera looks along +
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
+import cv2
 import numpy as np
 
 SKY_TOP = np.array((214, 224, 236), np.float32)
@@ -39,7 +41,9 @@ class Camera:
     """Vertical field of view, degrees."""
 
 
-def backdrop(width: int, height: int, camera: Camera, limbs_L4: np.ndarray | None = None) -> np.ndarray:
+def backdrop(
+    width: int, height: int, camera: Camera, limbs_L4: np.ndarray | None = None, *, exact: bool = True
+) -> np.ndarray:
     """Draws sky, floor and the shadow of the limbs.
 
     Args:
@@ -48,25 +52,74 @@ def backdrop(width: int, height: int, camera: Camera, limbs_L4: np.ndarray | Non
         camera: Where the picture is taken from.
         limbs_L4: Per limb its extent in x (low, high), the height of its lowest point and its
             radius, all in metres, (L, 4); None for an empty floor.
+        exact: Computes in doubles; else in half the time, with some pixels a grey level off.
 
     Returns:
         The picture, (H, W, 3), uint8 RGB.
     """
-    focal = height / 2 / np.tan(np.radians(camera.fovy) / 2)
+    ground = _ground(width, height, camera.z, camera.distance, camera.fovy, exact)
+    x_hW1 = ground.x_hW1 + np.float32(camera.x)
+    light_hW = _wave(x_hW1)
+    light_hW /= ground.pixel_h1
+    light_hW *= 0.5
+    light_hW *= ground.wave_y_h1
+    light_hW += 0.5
+    clear = None
+    if limbs_L4 is not None and len(limbs_L4):
+        clear = _shadow(ground, x_hW1, limbs_L4)
+
+    # Colour by colour: an inner loop over three bytes would cost as much as all the rest.
+    planes = []
+    scratch = np.empty(light_hW.shape, np.float32)
+    for colour, sky in enumerate(ground.sky):
+        plane = sky.copy()
+        floor = np.multiply(light_hW, ground.lift_3h1[colour], out=scratch)
+        floor += ground.dark_3h1[colour]
+        if clear is not None:
+            rows = floor[ground.near]
+            rows += clear * (SHADOW[colour] - rows)
+        floor += 0.5
+        plane[height // 2 :] = floor
+        planes.append(plane)
+    return cv2.merge(planes)
+
+
+@dataclass(frozen=True, slots=True)
+class _Ground:
+    """What all pictures from one height have in common, whatever the camera passes."""
+
+    sky: list[np.ndarray]
+    """Whole pictures, a plane each of red, green and blue, (H, W), uint8."""
+    y_h: np.ndarray
+    """Of each row of the floor, metres, (h,)."""
+    x_hW1: np.ndarray
+    """Of the borders of its pixels, from the camera, metres, (h, W + 1)."""
+    pixel_h1: np.ndarray
+    """Width of a pixel, metres, (h, 1)."""
+    wave_y_h1: np.ndarray
+    """Mean of the pattern across the track, -1..1, (h, 1)."""
+    dark_3h1: np.ndarray
+    """The colour of dark squares, (3, h, 1)."""
+    lift_3h1: np.ndarray
+    """How far the light ones are from it, (3, h, 1)."""
+    near: slice
+    """Rows that can be in shadow."""
+
+
+@lru_cache(8)
+def _ground(width: int, height: int, z: float, distance: float, fovy: float, exact: bool) -> _Ground:
+    """The camera keeps its height but for jumps, so this is hardly ever computed."""
+    focal = height / 2 / np.tan(np.radians(fovy) / 2)
     horizon = height // 2
-    image = np.empty((height, width, 3), np.float32)
-    image[:horizon] = _sky(horizon)[:, None]
+    sky = np.zeros((height, width, 3), np.uint8)
+    sky[:horizon] = (_sky(horizon)[:, None] + 0.5).astype(np.uint8)
 
     slope_h = (np.arange(horizon, height, dtype=np.float32) + 0.5 - height / 2) / focal
-    depth_h = camera.z / slope_h
-    y_h = depth_h - camera.distance
-    y_size_h = depth_h**2 / (camera.z * focal)
+    depth_h = z / slope_h
+    y_h = depth_h - distance
+    y_size_h = depth_h**2 / (z * focal)
     edges_W1 = (np.arange(width + 1, dtype=np.float32) - width / 2) / focal
-    x_hW1 = np.float32(camera.x) + depth_h[:, None] * edges_W1
-
-    wave_x_hW = np.diff(_triangle(x_hW1), axis=1) / (depth_h[:, None] / np.float32(focal))
     wave_y_h = (_triangle(y_h + y_size_h / 2) - _triangle(y_h - y_size_h / 2)) / y_size_h
-    light_hW = 0.5 + 0.5 * wave_x_hW * wave_y_h[:, None]
 
     # Row by row every colour is a blend of two, so the rest is one multiplication per pixel.
     dark_h3 = np.broadcast_to(CHECK_DARK, (len(y_h), 3))
@@ -74,16 +127,21 @@ def backdrop(width: int, height: int, camera: Camera, limbs_L4: np.ndarray | Non
     lane_h1 = _covered(y_h, y_size_h, -_LANE_HALF_WIDTH, _LANE_HALF_WIDTH)[:, None] * 0.6
     dark_h3 = dark_h3 + lane_h1 * (LANE - dark_h3)
     lift_h3 = lift_h3 * (1 - lane_h1)
-    fog_h1 = 1 - np.exp(-np.maximum(depth_h - camera.distance, 0) / 4.5)[:, None]
+    fog_h1 = 1 - np.exp(-np.maximum(depth_h - distance, 0) / 4.5)[:, None]
     dark_h3 = dark_h3 + fog_h1 * (SKY_HORIZON - dark_h3)
     lift_h3 = lift_h3 * (1 - fog_h1)
-    floor = image[horizon:]
-    np.multiply(light_hW[:, :, None], lift_h3[:, None], out=floor)
-    floor += dark_h3[:, None]
-
-    if limbs_L4 is not None and len(limbs_L4):
-        _add_shadow(floor, x_hW1, y_h, limbs_L4)
-    return (image + 0.5).astype(np.uint8)
+    near = np.flatnonzero(np.abs(y_h) < 0.7)
+    kind = np.float64 if exact else np.float32
+    return _Ground(
+        sky=[np.ascontiguousarray(sky[:, :, colour]) for colour in range(3)],
+        y_h=y_h.astype(kind),
+        x_hW1=(depth_h[:, None] * edges_W1).astype(kind),
+        pixel_h1=(depth_h[:, None] / np.float32(focal)).astype(kind),
+        wave_y_h1=wave_y_h[:, None].astype(kind),
+        dark_3h1=np.ascontiguousarray(dark_h3.T)[:, :, None].astype(kind),
+        lift_3h1=np.ascontiguousarray(lift_h3.T)[:, :, None].astype(kind),
+        near=slice(near[0], near[-1] + 1) if len(near) else slice(0, 0),
+    )
 
 
 def _sky(rows: int) -> np.ndarray:
@@ -103,19 +161,28 @@ def _covered(y_h: np.ndarray, size_h: np.ndarray, low: float, high: float) -> np
     return np.clip(overlap / size_h, 0, 1).astype(np.float32)
 
 
-def _add_shadow(floor: np.ndarray, x_hW1: np.ndarray, y_h: np.ndarray, limbs_L4: np.ndarray) -> None:
-    """Darkens the floor under the limbs: the higher a limb, the fainter and softer its shadow."""
-    near = np.flatnonzero(np.abs(y_h) < 0.7)
-    if not len(near):
-        return
-    rows = slice(near[0], near[-1] + 1)
-    x = (x_hW1[rows, 1:] + x_hW1[rows, :-1]) / 2
+def _wave(x_hW1: np.ndarray) -> np.ndarray:
+    """What ``_triangle`` adds from border to border, (h, W), metres."""
+    edge = x_hW1 * 0.5
+    np.floor(edge, out=edge)
+    edge *= -2
+    edge += x_hW1  # x modulo 2, to the bit
+    edge -= 1
+    np.abs(edge, out=edge)
+    np.subtract(1, edge, out=edge)
+    return edge[:, 1:] - edge[:, :-1]
+
+
+def _shadow(ground: _Ground, x_hW1: np.ndarray, limbs_L4: np.ndarray) -> np.ndarray:
+    """How dark it is under the limbs, 0..1, (near rows, W): the higher a limb, the fainter and softer."""
+    y = np.abs(ground.y_h[ground.near])
+    x = (x_hW1[ground.near, 1:] + x_hW1[ground.near, :-1]) / 2
     clear = np.ones_like(x)
     for low, high, lift, radius in limbs_L4.astype(np.float32):
         lift = max(float(lift), 0.0)
         soft = 0.035 + 0.16 * lift
         dark = 0.6 * np.exp(-lift / 0.9)
-        across = np.exp(-((np.maximum(np.abs(y_h[rows]) - radius * 0.6, 0) / (soft * 1.2)) ** 2))
+        across = np.exp(-((np.maximum(y - radius * 0.6, 0) / (soft * 1.2)) ** 2))
         along = 0.5 * (np.tanh((x - low) / soft) - np.tanh((x - high) / soft))
         clear *= 1 - (dark * across[:, None]).astype(np.float32) * along
-    floor[rows] += (1 - clear)[:, :, None] * (SHADOW - floor[rows])
+    return 1 - clear

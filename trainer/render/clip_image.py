@@ -55,10 +55,11 @@ def compose_clip(demo_frames: np.ndarray, *agent_frames: np.ndarray) -> bytes:
     for cell in range(rows * columns):  # those left over show the last frame
         frame = min(cell, len(demo_frames) - 1)
         y, x = cell // columns * SIDE_HEIGHT, cell % columns * width
-        moment = side_by_side(demo_frames[frame], *(frames[frame] for frames in agent_frames))
-        picture[y : y + SIDE_HEIGHT, x : x + width] = moment
-    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    done, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
+        for frames in (demo_frames, *agent_frames):
+            side = picture[y : y + SIDE_HEIGHT, x : x + SIDE_WIDTH]
+            cv2.cvtColor(fit(frames[frame]), cv2.COLOR_RGB2BGR, dst=side)
+            x += SIDE_WIDTH + GAP
+    done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
         raise RuntimeError("OpenCV could not encode a clip as JPEG")
     return encoded.tobytes()

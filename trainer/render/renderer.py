@@ -10,14 +10,19 @@ Shapes: T pictures, q positions, H rows, W columns.
 
 from __future__ import annotations
 
+import itertools
 import logging
+import math
 import queue
 import threading
+import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from contextlib import ExitStack
+from concurrent.futures import CancelledError, Future
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import cv2
 import gymnasium
@@ -53,17 +58,23 @@ class Renderer:
         width: Pixels, even.
         height: Pixels, even.
         model_path: The robot's MJCF file; a planar robot with a plane for a floor.
+        exact: Gives the same bits as ever, for what learns from pictures; else, for people, takes less than
+            two thirds of the time and is a grey level off in some pixels.
 
     Raises:
         UserError: If this machine cannot draw without a screen, naming the missing package.
     """
 
     def __init__(
-        self, width: int = WIDTH, height: int = HEIGHT, *, model_path: str | Path = HOPPER_XML
-    ) -> None:
+        self, width: int = WIDTH, height: int = HEIGHT, *, model_path: str | Path = HOPPER_XML,
+        exact: bool = True,
+    ) -> None:  # fmt: skip
         if width < 2 or height < 2 or width % 2 or height % 2:
             raise ValueError(f"the picture's size must be even and positive, got {width}x{height}")
         self.width, self.height = width, height
+        self._exact = exact
+        self.between: Callable[[], None] = lambda: None
+        """To be called by long jobs every tenth of a second: it may do something more urgent, or raise."""
         self._thread = threading.get_ident()
         big = (height * _SCALE, width * _SCALE)
         self._model = _studio_model(Path(model_path), width=big[1], height=big[0])
@@ -80,7 +91,7 @@ class Renderer:
         self._view.fixedcamid = self._model.camera("track").id
         self._distance = -float(self._model.camera("track").pos[1])
         self._rect = mujoco.MjrRect(0, 0, big[1], big[0])
-        self._pixels = np.empty((*big, 3), np.uint8)
+        self._pixels = np.empty(big[0] * big[1] * 3, np.uint8)
 
     def render(self, qpos_Tq: np.ndarray) -> np.ndarray:
         """Draws one picture per row of positions.
@@ -141,10 +152,50 @@ class Renderer:
         data.cam_xpos[self._view.fixedcamid] = (camera.x, -camera.distance, camera.z)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, self._option, None, self._view, everything, self._scene)
-        mujoco.mjr_render(self._rect, self._scene, self._mjr)
-        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._mjr)
-        image[:] = backdrop(self.width, self.height, camera, limbs_L4)
-        _paste(image, self._pixels)
+        image[:] = backdrop(self.width, self.height, camera, limbs_L4, exact=self._exact)
+        # Reading all of the picture would take longer than drawing the robot, which covers a tenth of it.
+        x0, y0, x1, y1 = _part(limbs_L4, top, camera, self.width, self.height)
+        if x0 >= x1 or y0 >= y1:
+            return
+        rect = mujoco.MjrRect(x0 * _SCALE, y0 * _SCALE, (x1 - x0) * _SCALE, (y1 - y0) * _SCALE)
+        pixels = self._pixels[: rect.height * rect.width * 3].reshape(rect.height, rect.width, 3)
+        if self._exact:
+            mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        else:  # clearing the rest, too
+            self._look_at(rect)
+            rect = mujoco.MjrRect(0, 0, rect.width, rect.height)
+            mujoco.mjr_render(rect, self._scene, self._mjr)
+        mujoco.mjr_readPixels(pixels, None, rect, self._mjr)
+        _paste(image[self.height - y1 : self.height - y0, x0:x1], pixels)
+
+    def _look_at(self, rect: mujoco.MjrRect) -> None:
+        """Narrows the view to a part of the picture, pixels from its lower left corner."""
+        for camera in self._scene.camera:
+            bottom = camera.frustum_bottom
+            pixel = (camera.frustum_top - bottom) / self._rect.height
+            camera.frustum_bottom = bottom + rect.bottom * pixel
+            camera.frustum_top = bottom + (rect.bottom + rect.height) * pixel
+            camera.frustum_center = (rect.left + rect.width / 2 - self._rect.width / 2) * pixel
+            camera.frustum_width = rect.width / 2 * pixel
+
+
+class Order(IntEnum):
+    """What is drawn first."""
+
+    AWAITED = 0
+    """Somebody looks at an empty frame."""
+    AHEAD = 1
+    """Somebody will."""
+    FILM = 2
+    """A long job, which lets others go first between its pictures (``Renderer.between``)."""
+
+
+class Drawing(Protocol):
+    """Whatever draws: a ``RenderThread``, or a process of its own."""
+
+    def submit(self, job: Callable[[Renderer], T], order: Order = ...) -> Future[T]:
+        """As ``RenderThread.submit``."""
+        ...
 
 
 class RenderThread:
@@ -154,20 +205,24 @@ class RenderThread:
         width: Pixels, even.
         height: Pixels, even.
         at_once: Whether to raise if this machine cannot draw; otherwise each job does, until one can.
+        exact: As of ``Renderer``.
 
     Raises:
         UserError: If this machine cannot draw without a screen.
     """
 
-    def __init__(self, width: int = WIDTH, height: int = HEIGHT, *, at_once: bool = True) -> None:
-        self._jobs: queue.SimpleQueue[tuple[Future[Any], Callable[[Renderer], Any]] | None]
-        self._jobs = queue.SimpleQueue()
+    def __init__(
+        self, width: int = WIDTH, height: int = HEIGHT, *, at_once: bool = True, exact: bool = True
+    ) -> None:
+        self._make = partial(Renderer, width, height, exact=exact)
+        self._jobs: queue.PriorityQueue[_Entry] = queue.PriorityQueue()
+        self._numbers = itertools.count()
         self._lock = threading.Lock()
         self._closed = False
+        self._renderer: Renderer | None = None
         started: Future[None] = Future()
-        self._thread = threading.Thread(
-            target=self._work, args=(width, height, started), name="render", daemon=True
-        )
+        self._put(Order.AWAITED, started, lambda _: None)
+        self._thread = threading.Thread(target=self._work, name="render", daemon=True)
         self._thread.start()
         try:
             started.result()
@@ -177,11 +232,12 @@ class RenderThread:
                 raise
             log.error("%s", error)
 
-    def submit(self, job: Callable[[Renderer], T]) -> Future[T]:
-        """Runs ``job(renderer)`` in the render thread, in the order of submission.
+    def submit(self, job: Callable[[Renderer], T], order: Order = Order.AHEAD) -> Future[T]:
+        """Runs ``job(renderer)`` in the render thread; of equal order in the order of submission.
 
         Args:
             job: Called with the thread's renderer.
+            order: What it comes before, or after.
 
         Returns:
             The future of what ``job`` returns or raises.
@@ -193,7 +249,7 @@ class RenderThread:
         with self._lock:
             if self._closed:
                 raise RuntimeError("the render thread is closed")
-            self._jobs.put((future, job))
+            self._put(order, future, job)
         return future
 
     def render(self, qpos_Tq: np.ndarray) -> Future[np.ndarray]:
@@ -201,11 +257,11 @@ class RenderThread:
         return self.submit(lambda renderer: renderer.render(qpos_Tq))
 
     def close(self) -> None:
-        """Ends the thread after the job in hand; jobs still waiting are cancelled."""
+        """Ends the thread after the picture in hand; jobs still waiting are cancelled."""
         with self._lock:
             if not self._closed:
                 self._closed = True
-                self._jobs.put(None)
+                self._put(_LAST, Future(), lambda _: None)
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -215,22 +271,59 @@ class RenderThread:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _work(self, width: int, height: int, started: Future[None]) -> None:
-        give_way()  # before the driver starts threads of its own
-        with ExitStack() as stack:
-            renderer: Renderer | None = None
-            entry: tuple[Future[Any], Callable[[Renderer], Any]] | None = (started, lambda _: None)
-            while entry is not None:
-                future, job = entry
-                if self._closed:
-                    future.cancel()
-                if future.set_running_or_notify_cancel():
-                    try:
-                        renderer = renderer or stack.enter_context(Renderer(width, height))
-                        future.set_result(job(renderer))
-                    except BaseException as error:
-                        future.set_exception(error)
-                entry = self._jobs.get()
+    def _put(self, order: int, future: Future[Any], job: Callable[[Renderer], Any]) -> None:
+        self._jobs.put(_Entry(order, next(self._numbers), future, job))
+
+    def _work(self) -> None:
+        give_way(_NICE)  # before the driver starts threads of its own
+        try:
+            while (entry := self._jobs.get()).order < _LAST:
+                self._do(entry)
+        finally:
+            if self._renderer is not None:
+                self._renderer.close()
+
+    def _do(self, entry: _Entry) -> None:
+        if self._closed:
+            entry.future.cancel()
+        if not entry.future.set_running_or_notify_cancel():
+            return
+        try:
+            if self._renderer is None:
+                self._renderer = self._make()
+                self._renderer.between = self._between
+            entry.future.set_result(entry.job(self._renderer))
+        except BaseException as error:
+            entry.future.set_exception(error)
+
+    def _between(self) -> None:
+        """Does what is more urgent than the film in hand; for a second at most, so that it ends some day."""
+        until = time.monotonic() + _PATIENCE_S
+        while not self._closed and time.monotonic() < until:
+            try:
+                entry = self._jobs.get_nowait()
+            except queue.Empty:
+                return
+            if entry.order >= Order.FILM:
+                self._jobs.put(entry)
+                return
+            self._do(entry)
+        if self._closed:
+            raise CancelledError("the render thread is closed")
+
+
+_LAST = max(Order) + 1
+_PATIENCE_S = 1.0
+_NICE = 5
+"""Behind the page, before practice: people wait for pictures."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Entry:
+    order: int
+    number: int
+    future: Future[Any] = field(compare=False)
+    job: Callable[[Renderer], Any] = field(compare=False)
 
 
 def _studio_model(path: Path, *, width: int, height: int) -> mujoco.MjModel:
@@ -267,6 +360,23 @@ def _limbs(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, floa
     return np.stack([low[:, 0], high[:, 0], low[:, 2], radius], 1), float(high[:, 2].max())
 
 
+def _part(
+    limbs_L4: np.ndarray, top: float, camera: Camera, width: int, height: int
+) -> tuple[int, int, int, int]:
+    """What part of the picture can hold the robot: left, bottom, right, top, pixels from below."""
+    focal = height / 2 / math.tan(math.radians(camera.fovy) / 2)
+    lowest, highest = limbs_L4.min(0).tolist(), limbs_L4.max(0).tolist()
+    # Whatever is left of the middle is furthest from it where it is nearest to the camera, or else farthest.
+    scales = (focal / (camera.distance - highest[3]), focal / camera.distance)
+    x0, x1 = (edge(scale * (x - camera.x) for scale in scales) + width / 2
+              for edge, x in ((min, lowest[0]), (max, highest[1])))  # fmt: skip
+    y0, y1 = (edge(scale * (z - camera.z) for scale in scales) + height / 2
+              for edge, z in ((min, lowest[2]), (max, top)))  # fmt: skip
+    low = [max(0, math.floor(edge) - 1) for edge in (x0, y0)]
+    high = [min(size, math.ceil(edge) + 1) for edge, size in ((x1, width), (y1, height))]
+    return low[0], low[1], high[0], high[1]
+
+
 def _paste(image: np.ndarray, pixels: np.ndarray) -> None:
     """Lays the robot over the backdrop, in place; black, the clear colour, is see-through.
 
@@ -275,16 +385,7 @@ def _paste(image: np.ndarray, pixels: np.ndarray) -> None:
         pixels: The robot on black, bottom row first, (2H, 2W, 3), uint8.
     """
     solid = cv2.bitwise_not(cv2.inRange(pixels, (0, 0, 0), (0, 0, 0)))
-    x, y, w, h = cv2.boundingRect(solid)
-    if not w:
-        return
-    # Cut to the robot, on even borders, before the arithmetic: it covers a tenth of the picture.
-    x0, y0 = x // _SCALE, y // _SCALE
-    x1, y1 = -(-(x + w) // _SCALE), -(-(y + h) // _SCALE)
-    cut = (slice(y0 * _SCALE, y1 * _SCALE), slice(x0 * _SCALE, x1 * _SCALE))
-    size = (x1 - x0, y1 - y0)
-    robot = cv2.resize(pixels[cut], size, interpolation=cv2.INTER_AREA)[::-1]
-    cover = cv2.resize(solid[cut], size, interpolation=cv2.INTER_AREA)[::-1, :, None]
-    rows = slice(image.shape[0] - y1, image.shape[0] - y0)
-    patch = image[rows, x0:x1]
-    image[rows, x0:x1] = robot + (patch * (255 - cover.astype(np.uint16)) // 255).astype(np.uint8)
+    size = image.shape[1::-1]
+    robot = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)[::-1]
+    cover = cv2.resize(solid, size, interpolation=cv2.INTER_AREA)[::-1, :, None]
+    image[:] = robot + (image * (255 - cover.astype(np.uint16)) // 255).astype(np.uint8)

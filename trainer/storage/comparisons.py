@@ -91,6 +91,17 @@ class Comparisons:
         rows = self._database.rows("SELECT run FROM pairs WHERE id = ?", (pair_id,))
         return rows[0][0] if rows else None
 
+    def pair_step(self, pair_id: int) -> int:
+        """The demo step that a pair begins beside.
+
+        Raises:
+            KeyError: If there is no such pair.
+        """
+        rows = self._database.rows("SELECT demo_step FROM pairs WHERE id = ?", (pair_id,))
+        if not rows:
+            raise KeyError(f"no pair {pair_id}")
+        return rows[0][0]
+
     def pair_segments(self, pair_id: int) -> tuple[Segment, Segment]:
         """Left and right of a pair.
 

@@ -10,29 +10,22 @@ from __future__ import annotations
 
 import io
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
-from onedemo.core.files import jpeg_fault, read_whole, replacing, sealed, write_atomic
-from onedemo.demos.library import read_frames
-from onedemo.demos.video import write_webm
-from onedemo.render.clip_image import side_by_side
-from onedemo.render.renderer import Renderer, RenderThread
+from onedemo.core.files import jpeg_fault, read_whole, write_atomic
+from onedemo.render.renderer import Order
 from onedemo.reward.episode_rules import mean_rating
 from onedemo.rl.rollouts import Transitions
-from onedemo.types import Demo
+from onedemo.training.pictures import Job, PictureFiles, draw_film, draw_strip
 
 PARTS = 40
 """Of the demo, each with a mean rating."""
-_SHOWN = 6
-_WIDTH, _HEIGHT = 160, 120
-_QUALITY = 82
-_AT_ONCE = 30
-"""Pictures in memory while a video is drawn: each is half a megabyte."""
 
 
 def by_part(rollouts: Transitions, demo_steps: int) -> list[float | None]:
@@ -108,13 +101,11 @@ class Gallery:
 
     Args:
         directory: Where they are kept.
-        demo: What they are shown beside.
-        dt: Seconds of a control step.
-        renderer: Draws; not closed here.
+        pictures: Has them drawn; None if nobody looks.
     """
 
-    def __init__(self, directory: Path, demo: Demo, dt: float, renderer: RenderThread) -> None:
-        self._directory, self._demo, self._dt, self._renderer = directory, demo, dt, renderer
+    def __init__(self, directory: Path, pictures: PictureFiles | None) -> None:
+        self._directory, self._pictures = directory, pictures
         self._lanes = Lanes()
 
     def note(
@@ -145,79 +136,33 @@ class Gallery:
         np.savez_compressed(buffer, qpos=qpos.astype(np.float32), frames=frames.astype(np.int32))
         write_atomic(self._file(iteration, "npz"), buffer.getvalue())
 
-    def file(self, iteration: int, suffix: str) -> Path:
+    def picture(self, iteration: int, suffix: str) -> Future[Path]:
         """The best rollout of an iteration as a filmstrip ("jpg") or a video ("webm"), drawn when asked for.
 
-        Any thread may ask; it waits for the render thread.
+        Any thread may ask. Videos are made behind clips, one at a time.
 
         Raises:
             FileNotFoundError: If none was kept.
         """
+        assert self._pictures is not None, "nothing is drawn here"
         file = self._file(iteration, suffix)
-        if file.exists() and (suffix != "jpg" or read_whole(file, jpeg_fault)):
-            return file
+        if suffix == "jpg":
+            read_whole(file, jpeg_fault)  # one that is damaged is set aside
+        order = Order.AWAITED if suffix == "jpg" else Order.FILM
+        return self._pictures.draw(file, lambda: self._job(iteration, file), order)
+
+    def _job(self, iteration: int, file: Path) -> Job:
+        assert self._pictures is not None
         kept = read_whole(self._file(iteration, "npz"))
         if kept is None:
             raise FileNotFoundError(f"nothing of iteration {iteration} is left")
         with np.load(io.BytesIO(kept), allow_pickle=False) as data:
             qpos, frames = data["qpos"].astype(np.float64), data["frames"]
-        if suffix == "jpg":
-            strip = self._renderer.submit(lambda renderer: filmstrip(renderer, qpos)).result()
-            write_atomic(file, sealed(strip))
-        else:
-            demo = read_frames(self._demo)
-            self._renderer.submit(
-                lambda renderer: write_video(
-                    file, renderer, qpos, demo, frames, dt=self._dt, fps=self._demo.fps
-                )
-            ).result()
-        return file
+        if file.suffix == ".jpg":
+            return partial(draw_strip, file=file, qpos=qpos)
+        return partial(
+            draw_film, file=file, demo=self._pictures.demo, qpos=qpos, frames=frames, dt=self._pictures.dt
+        )
 
     def _file(self, iteration: int, suffix: str) -> Path:
         return self._directory / f"{iteration:06d}.{suffix}"
-
-
-def filmstrip(renderer: Renderer, qpos: np.ndarray) -> bytes:
-    """Six moments of a rollout side by side, as JPEG.
-
-    Args:
-        renderer: Draws.
-        qpos: Positions, (T, q).
-    """
-    moments = np.round(np.linspace(0, len(qpos) - 1, _SHOWN)).astype(int)
-    frames = [
-        cv2.resize(frame, (_WIDTH, _HEIGHT), interpolation=cv2.INTER_AREA)
-        for frame in renderer.render(qpos[moments])
-    ]
-    picture = cv2.cvtColor(np.concatenate(frames, axis=1), cv2.COLOR_RGB2BGR)
-    done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    if not done:
-        raise RuntimeError("OpenCV could not encode a filmstrip")
-    return encoded.tobytes()
-
-
-def write_video(
-    file: Path, renderer: Renderer, qpos: np.ndarray, demo: np.ndarray, frames: np.ndarray, *, dt: float,
-    fps: float,
-) -> None:  # fmt: skip
-    """A rollout beside the demo, in real time, as WebM.
-
-    Args:
-        file: Where to.
-        renderer: Draws.
-        qpos: Positions, (L, q).
-        demo: The demo's frames, (F, H, W, 3), uint8.
-        frames: Which of them is beside each position, (L,).
-        dt: Seconds of a control step.
-        fps: Frames per second of the video.
-    """
-    shown = np.round(np.arange(0, len(qpos) * dt * fps) / fps / dt).astype(int)
-    shown = shown[shown < len(qpos)]
-
-    def pairs() -> Iterator[np.ndarray]:
-        for some in np.array_split(shown, -(-len(shown) // _AT_ONCE)):
-            for t, robot in zip(some, renderer.render(qpos[some]), strict=True):
-                yield side_by_side(demo[frames[t]], robot)
-
-    with replacing(file, ".webm") as half:
-        write_webm(half, pairs(), fps=fps)

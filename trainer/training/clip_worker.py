@@ -1,4 +1,4 @@
-"""Makes the pictures of clips: renders the robot, lays it beside the demo, writes one file per clip."""
+"""Has clips drawn: those to come ahead of time, and again those that somebody looks back at."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
-import numpy as np
-
-from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
+from onedemo.core.files import jpeg_fault, read_whole
 from onedemo.errors import in_words
-from onedemo.render.clip_image import compose_clip
-from onedemo.render.renderer import Renderer, RenderThread
+from onedemo.render.renderer import Order
 from onedemo.storage.store import Store
+from onedemo.training.pictures import PictureFiles
 from onedemo.types import Clip
 
 log = logging.getLogger("onedemo")
@@ -23,29 +21,18 @@ _RETRY_S = 5.0
 
 
 class ClipMaker:
-    """Turns clips of state "cut" into clips of state "ready", in the render thread.
+    """Turns clips of state "cut" into clips of state "ready".
 
     Args:
         store: Holds the segments; is told when a picture is there.
         file: Where the picture of a clip goes, by its number.
-        frames: The demo's frames, (F, H, W, 3), uint8.
-        frames_of: Demo frame at given control steps.
-        renderer: The thread that owns the GL context; not closed here.
+        pictures: Has them drawn.
     """
 
-    def __init__(
-        self,
-        store: Store,
-        *,
-        file: Callable[[int], Path],
-        frames: np.ndarray,
-        frames_of: Callable[[np.ndarray], np.ndarray],
-        renderer: RenderThread,
-    ) -> None:
+    def __init__(self, store: Store, *, file: Callable[[int], Path], pictures: PictureFiles) -> None:
         self._store = store
         self._file = file
-        self._frames, self._frames_of = frames, frames_of
-        self._renderer = renderer
+        self._pictures = pictures
         self._failed: list[Clip] = []
         self._failed_at = 0.0
         self.error = ""
@@ -54,8 +41,12 @@ class ClipMaker:
     def submit(self, clips: list[Clip]) -> None:
         """Queues clips; each becomes "ready" when its picture is on disk."""
         for clip in clips:
-            future = self._renderer.submit(lambda renderer, clip=clip: self._make(renderer, clip))
+            future = self._drawn(clip, Order.AHEAD)
             future.add_done_callback(lambda future, clip=clip: self._note(future, clip))
+
+    def picture(self, clip: Clip) -> Future[Path]:
+        """The future of a clip's picture, which is drawn again if it was deleted."""
+        return self._drawn(clip, Order.AWAITED)
 
     def retry(self) -> None:
         """Queues the clips that failed once more, a few seconds after: a full disk may have room now."""
@@ -67,19 +58,25 @@ class ClipMaker:
         """After a restart: queues what was cut but never drawn, and what lost its picture or a part of it."""
         lost = [c for c in self._store.clips.waiting(run) if not read_whole(self._file(c.id), jpeg_fault)]
         self._store.clips.set_state([c.id for c in lost], "cut")
-        self.submit(self._store.clips.waiting(run, state="cut"))
+        cut = self._store.clips.waiting(run, state="cut")
+        for clip in cut:
+            read_whole(self._file(clip.id), jpeg_fault)  # one that is damaged is set aside
+        self.submit(cut)
 
-    def _make(self, renderer: Renderer, clip: Clip) -> None:
-        segment = self._store.clips.segment(clip.id)
-        index, first = np.unique(self._frames_of(clip.demo_step + np.arange(clip.steps)), return_index=True)
-        agent = renderer.render(segment.qpos[first])
-        write_atomic(self._file(clip.id), sealed(compose_clip(self._frames[index], agent)))
-        self._store.clips.set_state([clip.id], "ready")
+    def _drawn(self, clip: Clip, order: Order) -> Future[Path]:
+        return self._pictures.clip(
+            self._file(clip.id), clip.demo_step, lambda: [self._store.clips.segment(clip.id)], order
+        )
 
-    def _note(self, future: Future[None], clip: Clip) -> None:
+    def _note(self, future: Future[Path], clip: Clip) -> None:
         if future.cancelled():
             return
         error, before = future.exception(), self.error
+        if error is None:
+            try:
+                self._store.clips.set_state([clip.id], "ready")
+            except Exception as failed:
+                error = failed
         self.error = in_words(error) if error is not None else ""
         if error is not None:
             if self.error != before:  # once, not with every try

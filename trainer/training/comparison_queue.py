@@ -8,17 +8,18 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
 
-from onedemo.core.files import jpeg_fault, read_whole, sealed, write_atomic
+from onedemo.core.files import jpeg_fault, read_whole
 from onedemo.queries.selection import choose
-from onedemo.render.clip_image import compose_clip
-from onedemo.render.renderer import Renderer, RenderThread
+from onedemo.render.renderer import Order
 from onedemo.storage.comparisons import NewPair, Pair
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
+from onedemo.training.pictures import PictureFiles
 from onedemo.types import Rollouts
 
 log = logging.getLogger("onedemo")
@@ -37,8 +38,7 @@ class ComparisonQueue:
         store: Holds them.
         run: Name of the run.
         file: Where the picture of a pair goes.
-        frames: The demo's frames, (F, H, W, 3), uint8.
-        renderer: Draws; not closed here.
+        pictures: Has them drawn.
         seed: Of what is drawn by lot.
     """
 
@@ -47,12 +47,11 @@ class ComparisonQueue:
         store: Store,
         run: str,
         file: Callable[[int], Path],
-        frames: np.ndarray,
-        renderer: RenderThread,
+        pictures: PictureFiles,
         seed: int,
     ) -> None:
         self._store, self._run, self._file = store, run, file
-        self._frames, self._renderer = frames, renderer
+        self._pictures = pictures
         self._rng = np.random.default_rng([seed, 1207])
         self._wanted_until = 0.0
         self._begun = False
@@ -91,21 +90,30 @@ class ComparisonQueue:
             for demo_step, left, right in drawn
         ]
         for pair in self._store.comparisons.add_pairs(self._run, new):
-            self._submit(pair, learner.frames_of)
+            drawn = self._drawn(pair.id, pair.demo_step, Order.AHEAD)
+            drawn.add_done_callback(lambda future, pair=pair: self._note(future, pair))
 
-    def _submit(self, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
-        self._renderer.submit(lambda renderer: self._make(renderer, pair, frames_of))
+    def picture(self, pair_id: int) -> Future[Path]:
+        """The future of a pair's picture, which is drawn again if it was deleted.
 
-    def _make(self, renderer: Renderer, pair: Pair, frames_of: Callable[[np.ndarray], np.ndarray]) -> None:
-        try:
-            left, right = self._store.comparisons.pair_segments(pair.id)
-            index, first = np.unique(frames_of(pair.demo_step + np.arange(pair.steps)), return_index=True)
-            robots = [renderer.render(segment.qpos[first]) for segment in (left, right)]
-            write_atomic(self._file(pair.id), sealed(compose_clip(self._frames[index], *robots)))
-            self._store.comparisons.set_pair_state([pair.id], "ready")
-        except Exception:
-            log.exception("pair %d could not be drawn", pair.id)
-            self._store.comparisons.set_pair_state([pair.id], "withdrawn")
+        Raises:
+            KeyError: If there is no such pair.
+        """
+        return self._drawn(pair_id, self._store.comparisons.pair_step(pair_id), Order.AWAITED)
+
+    def _drawn(self, pair_id: int, demo_step: int, order: Order) -> Future[Path]:
+        return self._pictures.clip(
+            self._file(pair_id), demo_step, lambda: self._store.comparisons.pair_segments(pair_id), order
+        )
+
+    def _note(self, future: Future[Path], pair: Pair) -> None:
+        if future.cancelled():
+            return
+        state = "ready"
+        if (error := future.exception()) is not None:
+            log.error("pair %d could not be drawn", pair.id, exc_info=error)
+            state = "withdrawn"
+        self._store.comparisons.set_pair_state([pair.id], state)
 
 
 _OLD = 10

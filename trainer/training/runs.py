@@ -53,8 +53,8 @@ def find_run(
     if not file.exists():  # lost with the directory; the database has it too
         write_atomic(file, run["config"].encode())
     config = load_config(file, _of_before(file))
-    if wanted is not None:  # where it computes is no part of what a run is
-        config = replace(config, device=wanted.device)
+    if wanted is not None:  # where it computes, and what it leaves on the disk, is no part of what a run is
+        config = replace(config, device=wanted.device, storage=wanted.storage)
     if wanted is not None and wanted != config:
         raise UserError(
             f"run {run['id']!r} has other settings than those given: {_differences(config, wanted)} "

@@ -63,8 +63,8 @@ class Trainer:
         self.directory = training.files.path
         self.acting = training.acting
         self.want_pairs = training.want_pairs
-        self.clip_file, self.pair_file = training.files.clip, training.files.pair
-        self.rollout_file = training.rollout_file
+        self.clip_picture, self.pair_picture = training.clip_picture, training.pair_picture
+        self.rollout_picture = training.rollout_picture
         self._held = held or ExitStack()
         self._control = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -96,11 +96,24 @@ class Trainer:
             if self._stop.is_set():
                 self._start()
 
-    def retire(self) -> None:
-        """Stops for good: ``resume`` does nothing from now on, until ``start``."""
+    def retire(self) -> bool:
+        """Stops for good: ``resume`` does nothing from now on, until ``start`` or ``readmit``.
+
+        Returns:
+            Whether anybody worked on the run, who had not been told to stop before.
+        """
         with self._control:
             self._retired = True
+            worked = self._thread is not None and not self._stop.is_set()
         self.stop()
+        return worked
+
+    def readmit(self, *, start: bool) -> None:
+        """Takes ``retire`` back, and starts the run again if it is to be."""
+        with self._control:
+            self._retired = False
+            if start:
+                self._start()
 
     def stop(self, timeout_s: float = 60.0) -> None:
         """Ends the run's thread after the iteration in hand; the checkpoint stays.

@@ -12,16 +12,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
-from onedemo.demos.library import read_frames
-from onedemo.render.renderer import RenderThread
+from onedemo.render.renderer import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
 from onedemo.reward.warm_start import keep_start
@@ -36,17 +37,29 @@ from onedemo.training.checkpoint import load_checkpoint, save_checkpoint
 from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.comparison_queue import ComparisonQueue
 from onedemo.training.learner import Learner
+from onedemo.training.pictures import PictureFiles, tidy
 from onedemo.training.rating_queue import RatingQueue, Simulated
-from onedemo.types import Demo, Rollouts
+from onedemo.types import Clip, Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.pose_estimator import PoseEstimator, Track
 from onedemo.vision.pose_estimator import learn as learn_pose_estimator
+
+_TIDY_S = 10.0
+"""Between two looks at what pictures can be deleted."""
+
+
+class _Drawn(NamedTuple):
+    """What is drawn of a run that somebody looks at."""
+
+    clips: ClipMaker
+    pairs: ComparisonQueue
+    rollouts: Gallery
 
 
 class TrainingRun:
     """One run: what it learns, its files, its place in the database. One thread at a time works on it.
 
-    Other threads may read its attributes, and call ``acting``, ``want_pairs`` and ``rollout_file``.
+    Other threads may read its attributes, and call ``acting``, ``want_pairs`` and what gives pictures.
 
     Args:
         store: Shared with the page.
@@ -73,7 +86,7 @@ class TrainingRun:
         demo: Demo,
         config: RunConfig,
         encoder: Encoder,
-        renderer: RenderThread | None = None,
+        renderer: Drawing | None = None,
         simulated: Simulated | None = None,
         cache_dir: Path | None = None,
         watch: Callable[[Learner, Snapshot], None] | None = None,
@@ -97,12 +110,18 @@ class TrainingRun:
         """Control steps per second in the last iteration."""
         self.preparing = "Looking at the video for the first time."
         """What ``look`` does, one sentence."""
-        self._encoder, self._renderer, self._learn_robot = encoder, renderer, learn_robot
+        self._encoder, self._learn_robot = encoder, learn_robot
         self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
-        self._gallery = None
+        self._drawn: _Drawn | None = None
         if renderer is not None:
-            self._gallery = Gallery(self.files.rollouts, demo, self.dt, renderer)
-        self._comparisons: ComparisonQueue | None = None
+            pictures = PictureFiles(renderer, demo, self.dt)
+            self.queue.clips = ClipMaker(store, file=self.files.clip, pictures=pictures)
+            self._drawn = _Drawn(
+                self.queue.clips,
+                ComparisonQueue(store, run, self.files.pair, pictures, config.seed),
+                Gallery(self.files.rollouts, pictures),
+            )
+        self._tidy_at = 0.0
         self._training_set = TrainingSet(store, run)
         self._fitted_event = 0
         self._pool: Rollouts | None = None
@@ -132,16 +151,8 @@ class TrainingRun:
             self._pool = learner.random_rollouts()
         self.learner, self.iteration, self.env_steps = learner, learner.iteration, learner.env_steps
         self._load_snapshot()
-        if self._renderer is not None:
-            frames = read_frames(self.demo)
-            self.queue.clips = ClipMaker(
-                self.store, file=self.files.clip, frames=frames, frames_of=learner.frames_of,
-                renderer=self._renderer,
-            )  # fmt: skip
-            self._comparisons = ComparisonQueue(
-                self.store, self.run, self.files.pair, frames, self._renderer, self.config.seed
-            )
-            self.queue.clips.recover(self.run)
+        if self._drawn is not None:
+            self._drawn.clips.recover(self.run)
 
     def look(self, check: Callable[[], None] = lambda: None) -> tuple[np.ndarray, Track | None]:
         """Looks at the demo, and at the robot if asked for: a minute or more the first time.
@@ -194,8 +205,11 @@ class TrainingRun:
     def ask(self) -> None:
         """Fills the queues of clips and pairs; simulated annotators answer at once."""
         self.queue.fill(self._opened, self._pool, self.snapshot)
-        if self._comparisons is not None:
-            self._comparisons.fill(self._opened, self._pool)
+        if self._drawn is not None:
+            self._drawn.pairs.fill(self._opened, self._pool)
+            if time.monotonic() > self._tidy_at:
+                self._tidy_at = time.monotonic() + _TIDY_S
+                tidy(self.store, self.files, self.config.storage.pictures_gb * 1e9)
 
     def refit(self, at_least: int = 1) -> bool:
         """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""
@@ -224,8 +238,9 @@ class TrainingRun:
         before = learner.env_steps
         rollouts, stats = learner.iterate(snapshot)
         stats |= self._true_reward(rollouts)
-        if self._gallery is not None:
-            stats |= self._gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
+        if self._drawn is not None:
+            gallery = self._drawn.rollouts
+            stats |= gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
         stats["steps_per_s"] = (learner.env_steps - before) / (time.monotonic() - began)
         self._pool, self._policy = rollouts, learner.policy()
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
@@ -253,20 +268,35 @@ class TrainingRun:
 
     def want_pairs(self) -> None:
         """Somebody would compare pairs: some are made while this is said every few seconds."""
-        if self._comparisons is not None:
-            self._comparisons.want()
+        if self._drawn is not None:
+            self._drawn.pairs.want()
 
-    def rollout_file(self, iteration: int, suffix: str) -> Path:
-        """The best rollout of an iteration, as ``Gallery.file``.
+    def clip_picture(self, clip: Clip) -> Future[Path]:
+        """The future of the picture of a clip of this run; drawn again if it was deleted."""
+        return self._pictured.clips.picture(clip)
+
+    def pair_picture(self, pair_id: int) -> Future[Path]:
+        """The same of a pair.
+
+        Raises:
+            KeyError: If there is none.
+        """
+        return self._pictured.pairs.picture(pair_id)
+
+    def rollout_picture(self, iteration: int, suffix: str) -> Future[Path]:
+        """The best rollout of an iteration, as ``Gallery.picture``.
 
         Raises:
             FileNotFoundError: If none was kept.
         """
-        if self._gallery is None:
-            raise FileNotFoundError(f"nothing of iteration {iteration} was kept")
-        return self._gallery.file(iteration, suffix)
+        return self._pictured.rollouts.picture(iteration, suffix)
 
     # Helpers
+
+    @property
+    def _pictured(self) -> _Drawn:
+        assert self._drawn is not None, "nobody looks at this run"
+        return self._drawn
 
     @property
     def _opened(self) -> Learner:

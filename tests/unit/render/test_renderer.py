@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import CancelledError
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ import pytest
 
 from helpers.paths import ROOT
 from onedemo.demos.frame_clock import frame_of_step, steps_of_frames
-from onedemo.render.backdrop import CHECK_DARK, SKY_HORIZON, SKY_TOP, Camera, backdrop
+from onedemo.render import renderer as renderer_module
+from onedemo.render.backdrop import CHECK_DARK, CHECK_LIGHT, LANE, SKY_HORIZON, SKY_TOP, Camera, backdrop
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer, RenderThread
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
@@ -184,6 +186,49 @@ def test_another_thread_is_told_to_use_the_render_thread(renderer):
     thread.start()
     thread.join()
     assert "RenderThread" in caught[0]
+
+
+@pytest.mark.seam
+def test_what_is_read_of_a_picture_holds_all_of_the_robot(monkeypatch):
+    """Also where it jumps, lies, or leaves the picture; and for people it looks the same."""
+    rng = np.random.default_rng(3)
+    poses = np.column_stack(
+        [rng.uniform(-20, 20, 12), rng.uniform(0.1, 3.0, 12), *rng.uniform(-3, 3, (4, 12))]
+    )
+    with Renderer() as renderer, Renderer(exact=False) as quick:
+        cut, people = renderer.render(poses).astype(int), quick.render(poses).astype(int)
+        monkeypatch.setattr(
+            renderer_module, "_part", lambda limbs, top, camera, width, height: (0, 0, width, height)
+        )
+        assert np.array_equal(renderer.render(poses), cut)
+    apart = np.abs(people - cut).max(-1)
+    assert (apart > 0).mean() < 1e-3 and (apart > 2).mean() < 1e-5
+
+
+def test_the_floor_is_what_the_formula_says_pixel_by_pixel():
+    for x, z in ((-31.7, 0.88), (0.0, 0.88), (12.345, 1.31)):
+        camera = replace(CAMERA, x=x, z=z)
+        picture = backdrop(480, 360, camera)
+        focal = 360 / 2 / np.tan(np.radians(camera.fovy) / 2)
+        for row in (180, 190, 230, 300, 359):
+            depth = camera.z / ((np.float32(row) + 0.5 - 180) / focal)
+            edges = (np.arange(481, dtype=np.float32) - 240) / focal
+            border = np.float32(camera.x) + depth * edges
+            wave = np.diff(1 - np.abs(np.mod(border, 2) - 1)) / (depth / np.float32(focal))
+            y, deep = depth - camera.distance, depth**2 / (camera.z * focal)
+            across = np.diff([1 - np.abs(np.mod(end, 2) - 1) for end in (y - deep / 2, y + deep / 2)]) / deep
+            covered = np.clip((min(y + deep / 2, 0.33) - max(y - deep / 2, -0.33)) / deep, 0, 1)
+            lane, fog = (
+                np.float32(covered) * np.float32(0.6),
+                1 - np.exp(-max(depth - camera.distance, 0) / 4.5),
+            )
+            dark = CHECK_DARK + lane * (LANE - CHECK_DARK)
+            dark = dark + fog * (SKY_HORIZON - dark)
+            lift = (CHECK_LIGHT - CHECK_DARK) * (1 - lane) * (1 - fog)
+            floor = (0.5 + 0.5 * wave[:, None] * across) * lift
+            wanted = (np.float32(floor) + dark + 0.5).astype(np.uint8)
+            assert np.abs(picture[row].astype(int) - wanted).max() <= 1
+            assert (picture[row] != wanted).mean() < 0.01
 
 
 # --- the render thread ----------------------------------------------------------------------------

@@ -91,6 +91,20 @@ def test_what_cannot_be_leaves_all_as_it_is(study, fields, words):
             study.open(name)
 
 
+def test_a_run_that_was_stopped_stays_so_if_another_cannot_be_opened(study):
+    before = study.trainer
+    with hold(before.data_dir / "runs/second/lock"):  # another process has it
+        for stopped in (False, True):
+            if stopped:
+                before.stop()
+            with pytest.raises(UserError, match="another onedemo"):
+                study.open("second")
+            assert study.trainer is before
+            assert (before.status().phase == "stopped") is stopped
+    before.resume()
+    assert before.status().phase != "stopped"
+
+
 class Served:
     def __init__(self, study):
         self.study = study

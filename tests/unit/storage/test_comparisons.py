@@ -14,7 +14,6 @@ from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
-from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
@@ -22,6 +21,7 @@ from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.comparison_queue import ComparisonQueue, draw_pairs
 from onedemo.training.learner import Learner
+from onedemo.training.pictures import PictureFiles
 from onedemo.types import Segment
 from unit.queries.test_selection import rollouts
 
@@ -176,9 +176,8 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
     demo = falling_demo(tmp_path / "demo")
     learner = Learner(small_config(), demo.frames, demo.fps)
     with RenderThread() as drawing:
-        queue = ComparisonQueue(
-            store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0
-        )
+        pictures = PictureFiles(drawing, demo, learner.dt)
+        queue = ComparisonQueue(store, "r", RunDirectory(tmp_path, "r").pair, pictures, seed=0)
         queue.fill(learner, learner.random_rollouts())
         assert store.comparisons.waiting_pairs("r", "cut") == []  # nobody looks
         queue.want()
@@ -211,9 +210,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         RunDirectory(tmp_path, "r").pair(lost).unlink()
         new = NewPair(demo_step=0, left=segment(), right=segment(), stage="pretrain", iteration=0)
         undrawn = store.comparisons.add_pairs("r", [new])[0].id
-        after = ComparisonQueue(
-            store, "r", RunDirectory(tmp_path, "r").pair, read_frames(demo), drawing, seed=0
-        )
+        after = ComparisonQueue(store, "r", RunDirectory(tmp_path, "r").pair, pictures, seed=0)
         after.want()
         after.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()

@@ -9,6 +9,7 @@ from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.rollouts import Transitions
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery
+from onedemo.training.pictures import PictureFiles
 from onedemo.types import Rollouts
 from unit.queries.test_selection import rollouts as empty_rollouts
 
@@ -25,7 +26,7 @@ def rated(clock, moved=1, **changes):
 
 
 def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there(tmp_path):
-    gallery = Gallery(tmp_path, None, 0.008, None)
+    gallery = Gallery(tmp_path, None)
     for moved, reached in ((1, 700), (2, 1000)):
         clock = np.tile(np.arange(200, reached, moved), (3, 1)).astype(np.int32)
         told = gallery.note(1, rated(clock, moved), lambda steps: steps * 240 // 1000, 1000)
@@ -40,7 +41,7 @@ def test_each_part_of_the_demo_has_the_mean_of_what_was_done_there(tmp_path):
 def test_the_best_of_an_iteration_is_a_whole_episode_although_an_iteration_is_a_quarter_of_one(tmp_path):
     """Two lanes, episodes of 1000 steps in iterations of 250; the second lane is 100 steps behind."""
     clocks = (np.arange(2000)[None] - np.array([[0], [100]])) % 1000
-    gallery = Gallery(tmp_path, None, 0.008, None)
+    gallery = Gallery(tmp_path, None)
     kept = []
     for k in range(8):
         clock = clocks[:, 250 * k : 250 * (k + 1)].astype(np.int32)
@@ -72,21 +73,21 @@ def test_the_best_rollout_is_drawn_when_asked_for_and_once(tmp_path):
     demo = falling_demo(tmp_path / "demo")
     states = falling_states()
     with RenderThread() as drawing:
-        gallery = Gallery(tmp_path / "rollouts", demo, 0.008, drawing)
+        gallery = Gallery(tmp_path / "rollouts", PictureFiles(drawing, demo, 0.008))
         gallery.keep(7, states.qpos[:125], np.arange(125) * 30 * 8 // 1000)
-        strip = gallery.file(7, "jpg")
+        strip = gallery.picture(7, "jpg").result(60)
         picture = cv2.imread(str(strip))
         assert picture.shape == (120, 960, 3)
         assert np.abs(picture[:, :160].astype(int) - picture[:, -160:]).max() > 60  # it falls
-        video = gallery.file(7, "webm")
+        video = gallery.picture(7, "webm").result(60)
         assert count_frames(video) == 30  # a second
         with VideoReader(video) as reader:
             _, frame = next(iter(reader.frames()))
             assert frame.shape == (360, 972, 3)
         written = video.stat().st_mtime_ns
-        assert gallery.file(7, "webm").stat().st_mtime_ns == written
+        assert gallery.picture(7, "webm").result(60).stat().st_mtime_ns == written
         with pytest.raises(FileNotFoundError):
-            gallery.file(8, "jpg")
+            gallery.picture(8, "jpg")
     assert sorted(f.suffix for f in (tmp_path / "rollouts").iterdir()) == [".jpg", ".npz", ".webm"]
 
 

@@ -77,6 +77,7 @@ def method_job(
 def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
     """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
     config = asdict(run_config({"ratings": 350, "set": {}, **settings}, 0))
+    del config["storage"]  # what a run leaves on the disk changes no result
     for section, added in _ADDED.items():
         for name, default in added.items():
             if config[section][name] == default:
