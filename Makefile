@@ -40,7 +40,9 @@ chaos: .venv/.installed-test
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
-	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json
+	PYTHONPATH=tests $(BIN)/python tests/load/hostile_archives.py --json promises/archives.json
+	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json \
+	  promises/archives.json
 
 soak: .venv/.installed-test
 	@mkdir -p promises

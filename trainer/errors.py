@@ -13,6 +13,10 @@ class UserError(Exception):
     """
 
 
+class DatabaseLost(UserError, sqlite3.OperationalError):
+    """The database's files were deleted or replaced while it was open: nothing can be written any more."""
+
+
 _CAUSES = {
     errno.ENOSPC: "The disk is full: free some space.",
     errno.EDQUOT: "The disk quota is used up: free some space.",

@@ -161,6 +161,8 @@ class Status:
     """How the run learns: "onedemo" or "paper"."""
     error: str = ""
     """If it failed: what went wrong, one sentence."""
+    saved: bool = True
+    """Whether ratings can be saved; False: the database's files are gone, and every press is refused."""
     iteration: int = 0
     """TRPO iterations so far."""
     env_steps: int = 0

@@ -24,7 +24,10 @@ def backup(file: Path, /, *, force: bool = False, data_dir: DataDir = DATA) -> N
         there = back_up(data_dir, file)
     except OSError as error:
         raise UserError(f"cannot write {file}: {error.strerror or error}") from None
-    print(f"{file}: {there['files']:,} files, {there['ratings']:,} ratings, {there['bytes'] / 1e6:,.1f} MB")
+    print(f"{file}: {there.files:,} files, {there.ratings:,} ratings, {there.bytes / 1e6:,.1f} MB")
+    if there.left_out:
+        names = ", ".join(there.left_out[:3]) + (", ..." if len(there.left_out) > 3 else "")
+        print(f"left out, since onedemo did not write it: {len(there.left_out)} files ({names})")
     print("it holds the secret behind people's links: keep it where only you can read it")
 
 
@@ -34,7 +37,7 @@ def restore(file: Path, /, *, data_dir: DataDir = DATA) -> None:
     Args:
         file: What `onedemo backup` wrote.
     """
-    from onedemo.app.admin.backup import restore
+    from onedemo.app.admin.restore import restore
 
     there = restore(file, data_dir)
     print(f"{data_dir}: {there['files']:,} files, {there['ratings']:,} ratings, links as they were")

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.seam
 
 def rate_some(site):
     store = site.trainer.store
-    store.database.rows("PRAGMA synchronous = OFF")
+    store.database._db.execute("PRAGMA synchronous = OFF")
     ids = site.trainer.add_clips(30)
     ann, bob = (store.accounts.ensure(name, "annotator").id for name in ("Ann", "Bob <i>"))
     for k, clip in enumerate(ids):

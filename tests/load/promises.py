@@ -28,6 +28,9 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
         ]
     if "mib" in found:
         return [("hours of rating and training", found["line"])]
+    if "hostile archives" in found:
+        said = f"{found['hostile archives']}, the slowest in {found['slowest, s']:.1f} s"
+        return [("hostile archives refused", said), ("of them broken through", f"{len(found['broken'])}")]
     videos = found["videos refused"] + found["videos taken"]
     return [
         ("messages fuzzed", f"{found['messages']:,}"),

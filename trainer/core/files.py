@@ -13,14 +13,20 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import IO
 
+from onedemo.core.directories import make_directory, sync_directory
 from onedemo.errors import UserError
 
 log = logging.getLogger("onedemo")
 
+_BLOCK = 1 << 20
+
 
 def write_atomic(path: Path, data: bytes | Iterable[bytes], *, sync: bool = True) -> None:
     """Writes a file to a temporary name, syncs and renames it: a reader never sees half of it.
+
+    It is as open to others as the directory that it lies in.
 
     Args:
         path: Where; missing directories are made.
@@ -47,27 +53,51 @@ def replacing(path: Path, suffix: str = "", *, sync: bool = True) -> Iterator[Pa
     Raises:
         OSError: As ``write_atomic``.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_directory(path.parent)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=suffix)
+    os.close(handle)
     temporary = Path(name)
     try:
-        os.fchmod(handle, 0o666 & ~umask())  # mkstemp makes files that nobody else can read
         yield temporary
-        if sync:
-            os.fsync(handle)
+        with temporary.open("rb") as file:  # whoever wrote it may have put another file under that name
+            os.fchmod(file.fileno(), _as_open_as(path.parent))
+            if sync:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    finally:
-        os.close(handle)
-    if not sync:
-        return
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)  # the rename itself must survive a power cut
-    finally:
-        os.close(directory)
+    if sync:
+        sync_directory(path.parent)
+
+
+def _as_open_as(directory: Path) -> int:
+    """The mode of a new file: readable, as far as the umask has it, by those who may enter its directory."""
+    return 0o600 | (0o666 & ~umask() & 6 * (directory.stat().st_mode & 0o011))
+
+
+def copy_synced(source: IO[bytes], path: Path, seen: Callable[[bytes], object] = lambda _: None) -> None:
+    """Copies a stream into a new file that only its owner may read, block by block, and syncs it.
+
+    Args:
+        source: Read to its end.
+        path: Must not be there.
+        seen: Called with every block.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    with open(path, "xb", opener=private_opener) as out:
+        while block := source.read(_BLOCK):
+            seen(block)
+            out.write(block)
+        out.flush()
+        os.fsync(out.fileno())
+
+
+def private_opener(path: str, flags: int) -> int:
+    """For ``open``: a file that is made is for its owner alone."""
+    return os.open(path, flags, 0o600)
 
 
 def archive_fault(data: bytes) -> str:
@@ -143,8 +173,8 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
     Raises:
         UserError: If another process holds it, and this one does not wait.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w") as file:
+    make_directory(path.parent)
+    with open(path, "w", opener=private_opener) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:

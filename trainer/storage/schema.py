@@ -6,6 +6,7 @@ to 4 were used before the first release; databases of those are refused.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 
 STEPS: dict[int, str] = {
@@ -264,6 +265,10 @@ STEPS: dict[int, str] = {
 }
 
 
+_TOKEN = re.compile(r"""('(?:[^']|'')*')|--[^\n]*|"(\w+)"|(\w+|[^\w\s])""", re.ASCII)
+"""A text, which counts to the letter; a comment, which does not; a quoted name; a word or a sign."""
+
+
 def check_version(connection: sqlite3.Connection) -> int:
     """The schema version of a database; reads only.
 
@@ -283,6 +288,67 @@ def check_version(connection: sqlite3.Connection) -> int:
             f"{max(STEPS)}); open it with the onedemo that wrote it, or choose another --data-dir"
         )
     return version
+
+
+def check_schema(connection: sqlite3.Connection) -> int:
+    """The version of a database whose tables, views and triggers are ours to the letter; reads no other.
+
+    Call it before anything else is asked of a database that may be somebody else's: a view may run for
+    ever, and a trigger or a computed column do what nobody wants.
+
+    Raises:
+        ValueError: As ``check_version``; or something is missing, different, or more than there should be.
+    """
+    version = check_version(connection)
+    if version == 0:
+        raise ValueError("not written by onedemo")
+    wanted, there = _objects(_made(version)), _objects(connection)
+    for key in sorted({*wanted, *there}, key=str):
+        if wanted.get(key) != there.get(key):
+            kind, name = key
+            how = "added" if key not in wanted else "removed" if key not in there else "changed"
+            raise ValueError(f"changed by another program: {kind} {ascii(str(name))[:80]} was {how}")
+    return version
+
+
+def _made(version: int) -> sqlite3.Connection:
+    """An empty database of that version, in memory."""
+    empty = sqlite3.connect(":memory:", isolation_level=None)
+    for number, step in sorted(STEPS.items()):
+        if number <= version:
+            empty.executescript(step)
+    return empty
+
+
+def _objects(connection: sqlite3.Connection) -> dict[tuple[str, str], tuple[str, list[list[str]]]]:
+    """(kind, name) to (table, parts of the SQL) of all that somebody wrote into a schema."""
+    rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+    return {
+        (kind, name): (table, _parts(str(sql)))
+        for kind, name, table, sql in rows
+        if (kind, name) != ("table", "sqlite_sequence")
+    }
+
+
+def _parts(sql: str) -> list[list[str]]:
+    """The words of a statement: its own, and those of each column of a table, in any order.
+
+    A column that came by ALTER TABLE stands elsewhere than one that was there from the first.
+    """
+    tokens = [text or name or word for text, name, word in _TOKEN.findall(sql)]
+    tokens = [token for token in tokens if token]  # a comment gives none
+    if tokens[:2] != ["CREATE", "TABLE"] or ")" not in tokens:
+        return [tokens]
+    close = len(tokens) - tokens[::-1].index(")") - 1
+    parts: list[list[str]] = [[]]
+    depth = 0
+    for token in tokens[:close]:
+        depth += (token == "(") - (token == ")")
+        if token == "," and depth == 1:
+            parts.append([])
+        else:
+            parts[-1].append(token)
+    return [*sorted(parts), tokens[close:]]
 
 
 def migrate(connection: sqlite3.Connection) -> None:

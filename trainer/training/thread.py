@@ -29,6 +29,7 @@ _MESSAGES = {
     "paused": "Practice is paused. Ratings still count.",
     "done": "The robot has practised as long as it was told to.",
     "stopped": "The run is stopped. It can be started again where it was.",
+    "lost": "Nothing that is said now is kept. Please stop, and tell the researcher.",
     "failed": (
         "The robot has stopped practising, and soon tries again. Your ratings are kept, and still count."
     ),
@@ -138,13 +139,16 @@ class Trainer:
         next_clips = None
         if phase in ("pretrain", "online") and self._work_s:
             next_clips = max(1.0, self._work_s - (time.monotonic() - self._work_began))
-        clips, snapshot = training.queue.clips, training.snapshot
-        message = _MESSAGES.get(phase, training.preparing)
+        clips, snapshot, lost = training.queue.clips, training.snapshot, self.store.database.fault
+        if lost:
+            phase = "failed"
+        message = _MESSAGES.get("lost" if lost else phase, training.preparing)
         return Status(
             phase=phase,
             message=message.format(config.ratings.pretrain),
             method=config.method,
-            error=self._error or (clips.error if clips is not None else ""),
+            saved=not lost,
+            error=lost or self._error or (clips.error if clips is not None else ""),
             iteration=training.iteration,
             env_steps=training.env_steps,
             total_steps=config.rollouts.total_steps,

@@ -1,8 +1,6 @@
 """Backup, restore and doctor, on data that real runs made, with files that are really damaged."""
 
-import hashlib
 import io
-import json
 import os
 import re
 import shutil
@@ -23,7 +21,8 @@ from helpers import beside_playwright
 from helpers.small_world import falling_demo, small_config
 from load.annotators import browser_session, open_tab, rating
 from load.serving import reach, serving
-from onedemo.app.admin.backup import MANIFEST, back_up, restore
+from onedemo.app.admin.backup import back_up
+from onedemo.app.admin.restore import restore
 from onedemo.app.cli.main import main
 from onedemo.app.http.tokens import read_secret
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
@@ -82,7 +81,7 @@ def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
     assert stat.S_IMODE((tmp_path / "all.zip").stat().st_mode) == 0o600
     restore(tmp_path / "all.zip", tmp_path / "again")
     assert tables(tmp_path / "again") == tables(data_dir)
-    assert files(tmp_path / "again") == files(data_dir) and len(files(data_dir)) == counts["files"] - 1
+    assert files(tmp_path / "again") == files(data_dir) and len(files(data_dir)) == counts.files - 1
     assert stat.S_IMODE((tmp_path / "again" / "link-secret").stat().st_mode) == 0o600
     # A run goes on from it as it would have from the original.
     ends = []
@@ -177,77 +176,6 @@ def test_a_predictor_that_the_copied_database_does_not_know_is_left_out(data_dir
     names = zipfile.ZipFile(tmp_path / "all.zip").namelist()
     assert any(name.endswith(newest.name) for name in names)
     assert not any("000099" in name or "000100" in name or name.endswith("lock") for name in names)
-
-
-def spoil(file, change):
-    """Writes the archive again, changed: name to content, or None to leave a file out."""
-    with zipfile.ZipFile(file) as archive:
-        entries = {entry.filename: archive.read(entry) for entry in archive.infolist()}
-    manifest = json.loads(entries.pop(MANIFEST))
-    extra = change(entries, manifest) or []
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, content in entries.items():
-            archive.writestr(name, content)
-        for entry, content in extra:
-            archive.writestr(entry, content)
-        archive.writestr(MANIFEST, json.dumps(manifest))
-
-
-def named(name, content=b"x", kind=stat.S_IFREG):
-    """A change that adds a file of that name, listed as it should be."""
-
-    def change(entries, manifest):
-        manifest["files"][name] = hashlib.sha256(content).hexdigest()
-        entry = zipfile.ZipInfo(name)
-        entry.external_attr = (kind | 0o644) << 16
-        return [(entry, content)]
-
-    return change
-
-
-def other_bytes(entries, manifest):
-    name = next(name for name in entries if name.endswith(".pt"))
-    entries[name] = entries[name][:-1] + b"!"
-
-
-def other_database(statement):
-    def change(entries, manifest):
-        with closing(sqlite3.connect(":memory:")) as db:
-            db.deserialize(entries[FILE_NAME])
-            db.execute(statement)
-            db.commit()
-            entries[FILE_NAME] = db.serialize()
-        manifest["files"][FILE_NAME] = hashlib.sha256(entries[FILE_NAME]).hexdigest()
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (other_bytes, "damaged: runs/.* is not what was saved"),
-        (lambda entries, _: entries.pop("link-secret") and None, "its files are not those"),
-        (lambda entries, _: entries.update(more=b"x"), "its files are not those"),
-        (lambda _, manifest: manifest.update(format=2), "newer onedemo .format 2.; update"),
-        (lambda _, manifest: manifest.pop("files") and None, "no backup of onedemo"),
-        (named("../outside"), "'../outside' is not the name of a plain file"),
-        (named("/tmp/outside"), "is not the name of a plain file"),
-        (named("demos/../../outside"), "is not the name of a plain file"),
-        (named("link", b"/etc/passwd", stat.S_IFLNK), "'link' is not the name of a plain file"),
-        (named("pipe", b"", stat.S_IFIFO), "'pipe' is not the name of a plain file"),
-        (other_database("PRAGMA user_version = 999"), "written by a newer onedemo .*version 999"),
-        (other_database("PRAGMA user_version = 4"), "the database in .* was written before onedemo 0.1.0"),
-        (other_database("DROP VIEW ratings"), "the database in .* is damaged"),
-    ],
-)  # fmt: skip
-def test_an_archive_that_is_not_as_saved_is_refused_whole(data_dir, tmp_path, change, said):
-    file = tmp_path / "all.zip"
-    back_up(data_dir, file)
-    spoil(file, change)
-    before = sorted(path.name for path in tmp_path.iterdir())
-    with pytest.raises(UserError, match=said):
-        restore(file, tmp_path / "again")
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_cut_off_or_strange_files_are_no_backups(data_dir, tmp_path):

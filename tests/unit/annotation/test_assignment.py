@@ -321,7 +321,7 @@ def test_shares_of_what_is_asked_again_are_as_set():
 
 
 def test_as_many_clips_come_to_several_people_and_twice_to_one_as_are_meant_to(store, clock):
-    store.database.rows("PRAGMA synchronous = OFF")
+    store.database._db.execute("PRAGMA synchronous = OFF")
     add_clips(store, 400)
     assignment = Assignment()
     sessions = [

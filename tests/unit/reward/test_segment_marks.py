@@ -73,7 +73,7 @@ def test_a_mark_over_pictures_covers_their_steps_and_no_others(fps, tmp_path):
     dt, steps, frames = 0.008, 38, int(8 * fps)
     demo = Demo(name="d", sha256="0", path=tmp_path, fps=fps, frames=frames, width=9, height=9)
     with closing(Store(tmp_path)) as store:
-        store.database.rows("PRAGMA synchronous = OFF")
+        store.database._db.execute("PRAGMA synchronous = OFF")
         store.runs.add(run="r", demo="d", demo_sha256="0", seed=0, config="", version="0")
         rater = store.accounts.ensure("Ann", "annotator").id
         zeros = {name: np.zeros((steps, n)) for name, n in dict(obs=11, actions=3, qpos=6, qvel=6).items()}

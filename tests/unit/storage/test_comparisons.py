@@ -72,8 +72,11 @@ def test_answers_hold_until_they_are_taken_back(store, pairs):
     with pytest.raises(ValueError, match="no pair 99"):
         store.comparisons.compare(99, ann, "left", 0)
     for change in ("UPDATE comparisons SET answer = 'left'", "DELETE FROM comparisons"):
-        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store.database.rows(change)
+        with (
+            pytest.raises(sqlite3.IntegrityError, match="append-only"),
+            store.database.transaction() as db,
+        ):
+            db.execute(change)
     left, right = store.comparisons.pair_segments(pairs[1])
     assert left.qpos[0, 0] == 1 and right.qpos[0, 0] == -1
 

@@ -24,11 +24,14 @@ def store(tmp_path):
 def steps_of(store, work, *values):
     """Instructions that SQLite's virtual machine executes for a piece of work."""
     count = itertools.count()
-    store.database._db.set_progress_handler(lambda: next(count) and None, 1)
+    connections = (store.database._db, store.database._reader)
+    for db in connections:
+        db.set_progress_handler(lambda: next(count) and None, 1)
     try:
         work(*values)
     finally:
-        store.database._db.set_progress_handler(None, 0)
+        for db in connections:
+            db.set_progress_handler(None, 0)
     return next(count)
 
 

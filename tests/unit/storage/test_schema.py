@@ -156,8 +156,11 @@ def test_marks_in_seconds_become_the_control_steps_that_they_were_made_of(tmp_pa
     with closing(Store(tmp_path)) as store:
         assert marks_of(store) == marks
         assert [(row[15], row[16]) for row in store.ratings.stream() if row[1] >= 100] == expected
-        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store.database.rows("UPDATE events SET mark_from = 0")
+        with (
+            pytest.raises(sqlite3.IntegrityError, match="append-only"),
+            store.database.transaction() as db,
+        ):
+            db.execute("UPDATE events SET mark_from = 0")
 
 
 def test_a_segment_of_a_database_that_began_as_schema_1_is_read(stored):

@@ -71,7 +71,7 @@ def test_another_program_reads_the_view(store, clips, ann):
 
 def test_durability_settings(store):
     assert store.database.rows("PRAGMA journal_mode") == [("wal",)]
-    assert store.database.rows("PRAGMA synchronous") == [(2,)]  # FULL
+    assert store.database._db.execute("PRAGMA synchronous").fetchone() == (2,)  # FULL
 
 
 @pytest.mark.parametrize("value", [0, 6, 2.5, "3", None, True, float("nan")])
@@ -98,8 +98,11 @@ def test_a_rating_of_no_clip_is_refused(store, ann):
 def test_events_cannot_be_changed_or_removed(store, clips, ann):
     store.ratings.rate(clips[0].id, ann.id, 4, latency_ms=1)
     for sql in ("UPDATE events SET value = 1", "DELETE FROM events"):
-        with pytest.raises(sqlite3.IntegrityError, match="append-only"):
-            store.database.rows(sql)
+        with (
+            pytest.raises(sqlite3.IntegrityError, match="append-only"),
+            store.database.transaction() as db,
+        ):
+            db.execute(sql)
     assert store.ratings.by_class() == [0, 0, 0, 1, 0]
 
 

@@ -56,7 +56,7 @@ def add_clips(store, run, count, stage):
 @pytest.fixture
 def store(tmp_path):
     store = Store(tmp_path)
-    store.database.rows("PRAGMA synchronous = OFF")  # thousands of commits
+    store.database._db.execute("PRAGMA synchronous = OFF")  # thousands of commits
     for run in RUNS:
         store.runs.add(run=run, demo="d", demo_sha256="0", seed=0, config="", version="0")
     yield store
@@ -100,11 +100,13 @@ def test_after_events_that_the_store_would_refuse(store):
     for _ in range(300):
         kind = ("rate", "skip", "undo")[int(rng.integers(3))]
         value = int(rng.integers(1, 6)) if kind == "rate" else None
-        store.database.rows(
-            "INSERT INTO events (clip_id, rater_id, kind, value, snapshot, latency_ms, created_at)"
-            " VALUES (?, ?, ?, ?, 0, 0, '')",
-            (clips[int(rng.integers(4))].id, int(rng.integers(1, 3)), kind, value),
-        )
+        row = (clips[int(rng.integers(4))].id, int(rng.integers(1, 3)), kind, value)
+        with store.database.transaction() as db:
+            db.execute(
+                "INSERT INTO events (clip_id, rater_id, kind, value, snapshot, latency_ms, created_at)"
+                " VALUES (?, ?, ?, ?, 0, 0, '')",
+                row,
+            )
         assert_kept_as_the_events_say(store)
 
 
