@@ -35,7 +35,10 @@ _BROKEN = 0.1
 """Share of pictures that cannot be decoded from which on a video is refused."""
 _LITTLE_REST = 0.5
 """Seconds: sound usually ends a little after the picture; only a longer rest is a still end."""
-_THUMB = (48, 48)
+_CELL = 12
+"""Pixels, of which one is made of a thumbnail: so many that compression does not show."""
+_STILL = 6
+"""Largest difference of two thumbnails, of 255, that compression makes of the same picture."""
 _OTHER = 20
 """Mean difference of two thumbnails, of 255, that no compression makes."""
 
@@ -137,13 +140,14 @@ class StoredCheck:
         if max(np.ptp(thumb, axis=(0, 1)).max() for thumb in self._given) < 3:
             raise UserError(f"{name} shows one colour and nothing else; choose another part with --start and "
                             f"--end, or convert it: {CONVERT}")  # fmt: skip
-        if max(cv2.absdiff(thumb, self._given[0]).max() for thumb in self._given) < 2:
+        if max(cv2.absdiff(thumb, self._given[0]).max() for thumb in self._given) <= _STILL:
             raise UserError(f"{name} shows a still picture: nothing moves; choose another part with --start "
                             "and --end")  # fmt: skip
 
 
 def _thumb(picture: np.ndarray) -> np.ndarray:
-    return cv2.resize(picture, _THUMB, interpolation=cv2.INTER_AREA)
+    size = [max(2, side // _CELL) for side in picture.shape[1::-1]]
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def check_options(

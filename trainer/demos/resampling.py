@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from fractions import Fraction
 from itertools import islice
 from typing import TypeVar
 
@@ -66,7 +65,7 @@ def resample(
     else:
         first, step = grid
         base = first + math.floor((start - first) / step + 0.25) * step
-        offset = step / 2 / Fraction(1 / (step * fps)).limit_denominator(_AROUND).denominator
+        offset = step / 2 / _repeats(1 / (step * fps))
     wanted = math.ceil((end - start - _SLACK) * fps) if end < math.inf else math.inf
     count, (last, picture) = 0, shown[0]
     while count < wanted:
@@ -105,3 +104,8 @@ def _grid(stamps: Sequence[float]) -> tuple[float, float] | None:
 
 def _usual(steps: np.ndarray) -> float:
     return float(np.sort(steps)[len(steps) // 2])
+
+
+def _repeats(ratio: float) -> int:
+    """After how many outputs they fall on the source's pictures as before: q for a ratio of about p / q."""
+    return next((q for q in range(1, 8) if abs(ratio - round(ratio * q) / q) < 0.05 * ratio), 8)

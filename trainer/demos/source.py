@@ -39,7 +39,7 @@ _SEEK_FROM = 5.0
 """Seconds before the wanted part from which on it is worth seeking."""
 _SILENT_ABOUT_TRACKS = ("matroska,webm", "mpegts", "mpeg", "flv", "asf", "ogg")
 """Containers that give a length of the whole, not of the picture."""
-_PICTURE_BY_PICTURE = ("apng",)
+_PICTURE_BY_PICTURE = ("apng", "gif")
 _SHORTEST_DELAY, _PLAYED_DELAY = 0.0105, 0.1
 """Seconds: browsers take animated pictures that ask for less than the first to mean the second."""
 
@@ -177,7 +177,12 @@ class Source:
 
     def _codec(self) -> str:
         """What the container calls the codec for which there is no decoder."""
-        said = "\n".join(self._container.dumps_format().splitlines())
+        level = av.logging.get_level()
+        av.logging.set_level(av.logging.INFO)
+        try:
+            said = self._container.dumps_format()
+        finally:
+            av.logging.set_level(level)
         found = re.search(r"Video: (\w+)[^\n]*?\((\w{4}) / 0x", said) or re.search(r"Video: (\w+)()", said)
         if not found:
             return "something unknown"
@@ -252,7 +257,7 @@ class Source:
     def _deinterlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
         """The same pictures, from the first that holds two moments on each turned into one moment."""
         graph, form = None, None
-        for frame in frames:
+        while (frame := next(frames, None)) is not None:
             self.broken += frame.is_corrupt
             now = (frame.width, frame.height, frame.format.name)
             if graph is not None and now != form:
@@ -260,6 +265,14 @@ class Source:
                 graph = None
             if graph is None and frame.interlaced_frame:
                 graph, form = _deinterlacer(frame, self._stream.time_base), now
+                # What moves is told by the picture before; the first of all is given the one after.
+                if (after := next(frames, None)) is not None:
+                    frames = chain((after,), frames)
+                    if (after.width, after.height, after.format.name) == form:
+                        graph.vpush(after)
+                        graph.vpush(frame)
+                        graph.vpull()
+                        continue
             if graph is None:
                 yield frame
             else:
