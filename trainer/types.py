@@ -18,7 +18,7 @@ class Demo:
 
     name: str
     sha256: str
-    """Of the normalised video file, hex."""
+    """Of its pictures, hex: what it is. Of older demos, of the file."""
     path: Path
     """The normalised video file."""
     fps: float

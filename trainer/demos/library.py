@@ -1,7 +1,10 @@
 """The library of demos: bring a video in, normalise it, list, find, read.
 
 A demo is a directory ``<demos_dir>/<sha256>/`` with ``video.webm`` and ``demo.json``; the ones that
-come with the program are ``static/demos/<name>.webm`` and ``<name>.json``.
+come with the program are ``static/demos/<name>.webm`` and ``<name>.json``. What a demo is, is its pictures:
+``sha256`` is of the frames as they were handed to the encoder, so that the same video gives the same demo
+anywhere, and ``video_sha256`` is of the file. In demos of before 2026-11-29, and in the built-in ones,
+``sha256`` is of the file.
 
 Shapes: n frames, H rows, W columns, T control steps, q positions.
 """
@@ -16,24 +19,27 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from onedemo import static
-from onedemo.core.files import write_atomic
+from onedemo.core.files import hold, write_atomic
 from onedemo.core.names import check_name
+from onedemo.demos.containers import check_file
 from onedemo.demos.frame_clock import steps_of_frames
-from onedemo.demos.import_checks import check_options
+from onedemo.demos.import_checks import StoredCheck, check_options
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
 from onedemo.demos.video import VideoReader, write_webm
 from onedemo.errors import UserError
 from onedemo.types import Demo
 
 BUILT_IN = Path(static.__file__).parent / "demos"
+_VIDEO = "video.webm"
 
 _log = logging.getLogger(__name__)
 
@@ -54,10 +60,10 @@ def import_video(
 ) -> Demo:
     """Brings a video in as a demo: trimmed, cropped, at a fixed rate, at most 640 px long.
 
-    The same video with the same options is the same demo, whatever it is called the second time.
+    The same pictures are the same demo, whatever it is called the second time.
 
     Args:
-        path: Any video file that OpenCV decodes.
+        path: Any video file that FFmpeg decodes.
         name: What to call it: letters, digits, '-' and '_', at most 64.
         demos_dir: Where demos are kept.
         start: First moment to use, seconds.
@@ -78,8 +84,7 @@ def import_video(
     path, demos_dir = Path(path), Path(demos_dir)
     check_name(name)
     check_options(start=start, end=end, crop=crop, fps=fps)
-    if not path.is_file():
-        raise UserError(f"there is no video file at {path}")
+    check_file(path)
     options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)
     origin = {
         "source_sha256": _sha256(path),
@@ -95,8 +100,7 @@ def import_video(
     for demo, about in stored:
         if {key: about.get(key) for key in origin} == origin:
             return demo
-    if name in {demo.name for demo, _ in stored}:
-        raise UserError(f"the name {name} is taken by another demo; choose another --name")
+    _check_free(name, (demo for demo, _ in stored))
     try:
         demos_dir.mkdir(parents=True, exist_ok=True)
         workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
@@ -105,31 +109,59 @@ def import_video(
     workshop.chmod(0o755)  # made for this user alone, but others may read demos
     try:
         video = workshop / "video.webm"
+        check, pictures = StoredCheck(), hashlib.sha256(f"{fps:g}".encode())
         with closing(decode(path, options, limits)) as frames:
-            count = write_webm(video, frames, fps=fps)
-        sha256 = _sha256(video)
+            count = write_webm(video, _noting(frames, check, pictures), fps=fps)
+        check.check_pictures(str(path))
+        with VideoReader(video) as reader:
+            for frame in reader.frames():
+                check.stored(frame)
         about = _describe(
             workshop / "demo.json",
             video,
             name=name,
-            sha256=sha256,
+            sha256=pictures.hexdigest(),
+            video_sha256=_sha256(video),
             fps=fps,
             frames=count,
             task=task,
-            source=source or path.name,
+            source=source or os.fsencode(path.name).decode("utf-8", "replace"),
             **origin,
         )
-        final = demos_dir / sha256
-        for demo, _ in stored:
-            if demo.sha256 == sha256:  # other options that give the same pictures
-                shutil.rmtree(workshop)
-                return demo
-        shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
-        os.replace(workshop, final)
-    except BaseException:
+        return _keep(workshop, about, demos_dir)
+    finally:
         shutil.rmtree(workshop, ignore_errors=True)
-        raise
-    return _demo(about, final / "video.webm")
+
+
+def remove_demo(demo: Demo, demos_dir: Path) -> None:
+    """Deletes a demo with all that was made from its pictures.
+
+    Raises:
+        UserError: If it came with the program, or cannot be deleted.
+    """
+    directory = _own_directory(demo, demos_dir)
+    away = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+    try:
+        os.replace(directory, away / "gone")  # at once: half a demo would be a damaged one
+    except OSError as error:
+        raise UserError(f"cannot delete {directory}: {error.strerror}") from error
+    finally:
+        shutil.rmtree(away, ignore_errors=True)
+
+
+def rename_demo(demo: Demo, name: str, demos_dir: Path) -> Demo:
+    """Gives a demo another name.
+
+    Raises:
+        UserError: If it came with the program, or the name is not allowed or taken.
+    """
+    check_name(name)
+    path = _own_directory(demo, demos_dir) / "demo.json"
+    with _names(demos_dir):
+        _check_free(name, list_demos(demos_dir))
+        about = json.loads(path.read_bytes()) | {"name": name}
+        write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
+    return replace(demo, name=name)
 
 
 def render_demo(
@@ -191,6 +223,16 @@ def list_demos(demos_dir: Path) -> list[Demo]:
     return sorted((demo for demo, _ in _load_all(Path(demos_dir))), key=lambda demo: demo.name)
 
 
+def is_whole(demo: Demo) -> bool:
+    """Whether the stored video is, to the byte, what was stored."""
+    about = demo.path.with_name("demo.json") if demo.path.name == _VIDEO else demo.path.with_suffix(".json")
+    try:
+        known = json.loads(about.read_bytes())
+        return _sha256(demo.path) == known.get("video_sha256", known["sha256"])
+    except (OSError, ValueError, KeyError):
+        return False
+
+
 def find_demo(name: str, demos_dir: Path) -> Demo:
     """The demo of that name.
 
@@ -234,9 +276,9 @@ def stream_frames(demo: Demo) -> Iterator[np.ndarray]:
     count = 0
     try:
         with VideoReader(demo.path) as reader:
-            for _, frame in reader.frames():
+            for frame in reader.frames():
                 count += 1
-                if frame is None or count > demo.frames:
+                if count > demo.frames:
                     break
                 yield frame
     except UserError:  # its advice is for videos on their way in
@@ -262,10 +304,53 @@ def show(demo: Demo) -> str:
     return "\n".join(f"{key:<7} {value}" for key, value in lines.items())
 
 
+def _noting(
+    frames: Iterable[np.ndarray], check: StoredCheck, pictures: hashlib._Hash
+) -> Iterator[np.ndarray]:
+    """The same frames; what they show is noted on the way."""
+    for number, frame in enumerate(frames):
+        if number == 0:
+            pictures.update(str(frame.shape).encode())
+        pictures.update(frame.data)
+        yield check.given(frame)
+
+
+def _keep(workshop: Path, about: dict[str, Any], demos_dir: Path) -> Demo:
+    """Makes what was brought in a demo; gives the one there is if it has the same pictures."""
+    with _names(demos_dir):  # somebody else may have added one meanwhile
+        there = list_demos(demos_dir)
+        for demo in there:
+            if demo.sha256 == about["sha256"]:
+                return demo
+        _check_free(about["name"], there)
+        final = demos_dir / about["sha256"]
+        shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
+        os.replace(workshop, final)
+    return _demo(about, final / _VIDEO)
+
+
+def _names(demos_dir: Path) -> AbstractContextManager[None]:
+    """One process at a time gives a name."""
+    return hold(demos_dir.with_name(f"{demos_dir.name}.lock"), wait=True)
+
+
+def _check_free(name: str, demos: Iterable[Demo]) -> None:
+    if name in {demo.name for demo in demos}:
+        raise UserError(f"the name {name} is taken by another demo; choose another --name")
+
+
+def _own_directory(demo: Demo, demos_dir: Path) -> Path:
+    """Where a demo of this library lies."""
+    directory = demo.path.parent
+    if directory.parent != demos_dir:
+        raise UserError(f"the demo {demo.name} comes with the program: it can be neither removed nor renamed")
+    return directory
+
+
 def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
     """Writes the demo's JSON and returns it."""
     with VideoReader(video) as reader:
-        about |= {"width": reader.info.width, "height": reader.info.height}
+        about |= {"width": reader.width, "height": reader.height}
     write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
     return about
 

@@ -2,7 +2,8 @@
 
 Decoders are large, written in C, and fed by strangers. The process that serves the page never opens such
 a file with them: a child does, and sends back plain pixels through a pipe, which are counted and measured
-again here. The child is a limited process, not a sandbox: it still runs as the same user.
+again here. The child (``onedemo.demos.decoder_child``) is given the open file, and once it has loaded its
+libraries it can open no other. It is a limited process, not a sandbox: it still runs as the same user.
 
 What comes through the pipe: ``S`` with width and height, then ``F`` with the pixels of one frame, any
 number of times, then ``D``; or at any time ``E`` and a sentence.
@@ -12,37 +13,36 @@ Shapes: H rows, W columns; frames are uint8 RGB.
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import logging
 import math
 import os
-import resource
+import re
 import signal
 import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-import cv2
 import numpy as np
 
-from onedemo.demos.import_checks import MAX_SECONDS, SourceWatch, check_length, check_size
-from onedemo.demos.video import VideoReader, resample
+from onedemo.demos.containers import CONVERT
+from onedemo.demos.import_checks import MAX_SECONDS, STORED_SIDE
 from onedemo.errors import UserError
 
-STORED_SIDE = 640
-"""Pixels, of the longer side of what is stored: more than a clip ever shows."""
-_FORMATS = (
-    "mov,mp4,matroska,webm,avi,gif,mjpeg,mpegts,mpeg,mpegvideo,h264,hevc,flv,asf,ogg,jpeg_pipe,png_pipe"
-)
-"""What may be inside. Playlists are left out: they make the decoder open other files and addresses."""
-_SIZE = struct.Struct("<HH")
-_MAX_SENTENCE = 2000
+SIZE = struct.Struct("<HH")
+MAX_SENTENCE = 2000
 """Bytes of a complaint that are read."""
+_LIBRARIES = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
+_FEW_THREADS = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "MALLOC_ARENA_MAX": "2"}
+"""Else each core of the machine brings threads, and each thread an arena of 64 MB."""
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,7 +50,9 @@ class Limits:
     """What decoding one video may take."""
 
     memory: int = 2 << 30
-    """Bytes of address space; Python and OpenCV without a video take 0.6 GB of it."""
+    """Bytes: of address space where the system limits it (Python and the libraries without a video take
+    0.8 GB of it), else of memory. The decoder's threads are of a fixed number, so it is the same on any
+    machine."""
     cpu_seconds: int = 300
     """Of all its threads together."""
     wall_seconds: float = 300
@@ -93,23 +95,37 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
         UserError: If it is no usable video, or takes more than it may; frames may have come before.
     """
     limits = limits or Limits()
+    if importlib.util.find_spec("resource") is None:
+        raise UserError(
+            "this system cannot limit what decoding a video takes; add videos on Linux or macOS "
+            "(on Windows: in WSL 2)"
+        )
     root = str(Path(__file__).resolve().parents[2])
-    told = json.dumps([str(path.resolve()), _plain(options), limits.memory, limits.cpu_seconds])
-    child = subprocess.Popen(
-        [sys.executable, "-P", "-B", "-m", "onedemo.demos.sandboxed_decoder", told],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        cwd="/",
-        # Nothing of this process's surroundings, least of all a secret in a variable.
-        env={
-            "PYTHONPATH": root,
-            "OPENBLAS_NUM_THREADS": "1",
-            "OPENCV_FFMPEG_LOGLEVEL": "-8",
-            "OPENCV_FFMPEG_CAPTURE_OPTIONS": f"protocol_whitelist;file|format_whitelist;{_FORMATS}",
-        },
-        start_new_session=True,
-    )
+    told = json.dumps([str(path), _plain(options), limits.memory, limits.cpu_seconds])
+    surroundings = {name: os.environ[name] for name in _LIBRARIES if name in os.environ}
+    complaints, complaining = os.pipe()
+    os.set_blocking(complaints, False)
+    os.set_blocking(complaining, False)  # a child that complains without end does not wait for a reader
+    try:
+        with path.open("rb") as file:
+            child = subprocess.Popen(
+                [sys.executable, "-P", "-B", "-m", "onedemo.demos.decoder_child", told],
+                stdin=file,
+                stdout=subprocess.PIPE,
+                stderr=complaining,
+                cwd="/",
+                # Nothing of this process's surroundings, least of all a secret in a variable, but for
+                # where a Python without a fixed place finds its library.
+                env=surroundings | {"PYTHONPATH": root} | _FEW_THREADS,
+                start_new_session=True,
+            )
+    except BaseException as error:
+        os.close(complaints)
+        if isinstance(error, OSError):
+            raise UserError(f"{path} cannot be read: {error.strerror}") from error
+        raise
+    finally:
+        os.close(complaining)
     late = threading.Event()
 
     def stop() -> None:
@@ -126,12 +142,13 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
             child.stdout.close()  # or it may wait for ever to be read
             with suppress(subprocess.TimeoutExpired):
                 child.wait(timeout=2)
-            raise _explain(path, child.poll(), late.is_set(), limits)
+            raise _explain(path, child.poll(), late.is_set(), limits, _last_line(complaints))
     finally:
         timer.cancel()
         child.kill()
         child.stdout.close()
         child.wait()
+        os.close(complaints)
 
 
 def _receive(path: Path, pipe: IO[bytes], options: Options) -> Generator[np.ndarray, None, bool]:
@@ -140,7 +157,7 @@ def _receive(path: Path, pipe: IO[bytes], options: Options) -> Generator[np.ndar
     for count in range(options.most_frames + 2):
         tag = pipe.read(1)
         if tag == b"S" and count == 0:
-            width, height = _SIZE.unpack(pipe.read(_SIZE.size).ljust(_SIZE.size, b"\0"))
+            width, height = SIZE.unpack(pipe.read(SIZE.size).ljust(SIZE.size, b"\0"))
             if not (2 <= width <= STORED_SIDE and 2 <= height <= STORED_SIDE) or width % 2 or height % 2:
                 return False
             size = (height, width, 3)
@@ -150,109 +167,43 @@ def _receive(path: Path, pipe: IO[bytes], options: Options) -> Generator[np.ndar
                 return False
             yield np.frombuffer(pixels, np.uint8).reshape(size)
         elif tag == b"E":
-            sentence = pipe.read(_MAX_SENTENCE).decode("utf-8", "replace")
+            sentence = pipe.read(MAX_SENTENCE).decode("utf-8", "replace")
             raise UserError("".join(c if c.isprintable() else " " for c in sentence).strip())
         else:
             return tag == b"D" and size is not None
     return False
 
 
-def _explain(path: Path, code: int | None, late: bool, limits: Limits) -> UserError:
+def _last_line(complaints: int) -> str:
+    """The last that the child said on its way out, as one printable line."""
+    try:
+        said = os.read(complaints, 1 << 16).decode("utf-8", "replace")
+    except BlockingIOError:
+        return ""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    return "".join(c if c.isprintable() else " " for c in lines[-1])[:300] if lines else ""
+
+
+def _explain(path: Path, code: int | None, late: bool, limits: Limits, last: str) -> UserError:
     """Why a child ended before it was done."""
     if late or code == -signal.SIGXCPU:
         allowed = limits.wall_seconds if late else limits.cpu_seconds
         return UserError(
             f"{path} takes longer than {allowed:g} s to decode; scale it down, or give a shorter part of it"
         )
-    return UserError(
-        f"{path} cannot be decoded: it is damaged, or needs more memory than a video may; "
-        "convert it to a plain mp4 and try again"
-    )
-
-
-# --- in the child ---------------------------------------------------------------------------------
-
-
-def shaped_frames(path: Path, options: Options) -> Iterator[np.ndarray]:
-    """The same frames, decoded in this process: for files that are trusted, and for the child.
-
-    Raises:
-        UserError: If the video is unusable; frames may have come before.
-    """
-    start, end = options.start or 0.0, options.end
-    with VideoReader(path) as reader:
-        check_size(path, reader.info.width, reader.info.height, options.crop)
-        check_length(path, reader.info.seconds, start=start, end=end)
-        watch = SourceWatch(path, reader, start=start, end=end)
-        count = 0
-        for frame in resample(
-            watch.frames(),
-            fps=options.fps,
-            period=1 / reader.info.fps,
-            start=start,
-            end=math.inf if end is None else end,
-        ):
-            yield _shape(frame, crop=options.crop, mirror=options.mirror)
-            count += 1
-        watch.check_whole(count)
-
-
-def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
-    """Crops, mirrors and scales one frame; sides come out even, as the codec wants them."""
-    if crop is not None:
-        x, y, w, h = crop
-        frame = frame[y : y + h, x : x + w]
-    if mirror:
-        frame = frame[:, ::-1]
-    height, width = frame.shape[:2]
-    scale = min(1.0, STORED_SIDE / max(height, width))
-    size = (max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2))
-    if size == (width, height):
-        return np.ascontiguousarray(frame)
-    return cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
+    _log.warning("the process that decodes %s ended with status %s: %s", ascii(str(path)), code, last)
+    if re.search("MemoryError|[Cc]annot allocate|Insufficient memory|bad_alloc|ENOMEM", last):
+        return UserError(
+            f"{path} cannot be decoded: it needs more memory than a video may "
+            f"({limits.memory >> 20} MB); scale it down: ffmpeg -i x -vf scale=1280:-2 -c:v libx264 y.mp4"
+        )
+    if last:
+        why = f"the process that decodes it ended with: {last}"
+    else:
+        name = signal.Signals(-code).name if code is not None and code < 0 else f"status {code}"
+        why = f"the process that decodes it ended with {name}, as damaged videos make it"
+    return UserError(f"{path} cannot be decoded: {why}; a plain video may help: {CONVERT}")
 
 
 def _plain(options: Options) -> dict[str, Any]:
     return {name: getattr(options, name) for name in ("start", "end", "crop", "mirror", "fps")}
-
-
-def _limit(memory: int, cpu_seconds: int) -> None:
-    """Takes from this process what decoding does not need, for good."""
-    for what, most in (
-        (resource.RLIMIT_AS, memory),
-        (resource.RLIMIT_CPU, cpu_seconds),
-        (resource.RLIMIT_FSIZE, 0),  # it writes no file, only into the pipe
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_NOFILE, 32),
-    ):
-        hard = resource.getrlimit(what)[1]
-        most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        # The soft limit of the processor time alone says which limit it was: the hard one is SIGKILL.
-        resource.setrlimit(what, (most, most + 1 if what == resource.RLIMIT_CPU else most))
-
-
-def _main(told: str) -> None:
-    path, options, memory, cpu_seconds = json.loads(told)
-    _limit(memory, cpu_seconds)
-    crop = options.pop("crop")
-    out = os.fdopen(os.dup(1), "wb", buffering=1 << 16)
-    try:
-        frames = shaped_frames(Path(path), Options(**options, crop=tuple(crop) if crop else None))
-        for number, frame in enumerate(frames):
-            if number == 0:
-                out.write(b"S" + _SIZE.pack(frame.shape[1], frame.shape[0]))
-            out.write(b"F")
-            out.write(frame.data)
-        out.write(b"D")
-    except UserError as error:
-        out.write(b"E" + str(error).encode("utf-8", "replace")[:_MAX_SENTENCE])
-    except BrokenPipeError:
-        pass  # nobody wants the rest
-    try:
-        out.flush()
-    except BrokenPipeError:
-        os._exit(0)
-
-
-if __name__ == "__main__":
-    _main(sys.argv[1])

@@ -1,4 +1,4 @@
-"""Video files in and out: decoding with trustworthy time stamps, and writing WebM.
+"""The videos that are kept: written as WebM, and read. What comes in is ``onedemo.demos.source``.
 
 Written is VP8 in WebM: it decodes frame by frame as written and plays in every browser. VP9 through
 OpenCV gives the same size and half a decibel more, in four times the time.
@@ -8,10 +8,8 @@ Shapes: n frames, H rows, W columns; frames are uint8 RGB.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,37 +17,23 @@ import numpy as np
 
 from onedemo.errors import UserError
 
-_ASSUMED_FPS = 30.0
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class VideoInfo:
-    """What the container says about itself; the last two may be wrong."""
-
-    width: int
-    """Pixels, upright (a phone's rotation mark is obeyed)."""
-    height: int
-    """Pixels."""
-    fps: float
-    """Frames per second; 30 where the container names no sensible rate."""
-    frames: int
-    """How many frames, 0 where the container does not say."""
-
-    @property
-    def seconds(self) -> float:
-        """Length by the container, 0.0 where it does not say."""
-        return self.frames / self.fps
-
 
 class VideoReader:
-    """A video file, opened for reading from the beginning, once.
+    """A video that ``write_webm`` wrote, opened for reading from the beginning, once.
 
     Args:
-        path: The file; any container and codec that OpenCV's FFmpeg decodes.
+        path: The file.
 
     Raises:
         UserError: If there is no such file or it is not a video.
     """
+
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    fps: float
+    """Frames per second."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
@@ -59,52 +43,27 @@ class VideoReader:
             self._capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
         finally:
             cv2.utils.logging.setLogLevel(level)
-        width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if not self._capture.isOpened() or width < 1 or height < 1:
+        self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        self.fps = self._capture.get(cv2.CAP_PROP_FPS)
+        if not self._capture.isOpened() or self.width < 1 or self.height < 1:
             self._capture.release()
-            raise UserError(
-                f"{path} is not a video that can be read, or it is cut off before its index; "
-                "give a whole mp4, mov, webm, avi or gif file"
-            )
-        fps = self._capture.get(cv2.CAP_PROP_FPS)
-        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.info = VideoInfo(
-            width=width,
-            height=height,
-            fps=fps if math.isfinite(fps) and 0.1 <= fps <= 1000 else _ASSUMED_FPS,
-            frames=int(count) if math.isfinite(count) and 0 < count < 1e9 else 0,
-        )
+            raise UserError(f"{path} is not a video that can be read")
 
-    def frames(self, start: float = 0.0) -> Iterator[tuple[float, np.ndarray | None]]:
-        """Yields (seconds since the first frame, frame) in order.
+    def frames(self) -> Iterator[np.ndarray]:
+        """The frames in order, (H, W, 3)."""
+        while True:
+            whole, picture = self._capture.read()
+            if not whole:
+                return
+            yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
-        Time stamps are the container's; one that does not move on (all zero in some AVI and raw
-        streams) is replaced by the one before plus a frame at the nominal rate.
-
-        Args:
-            start: Frames that have ended before this time come without their picture (None):
-                skipping them is several times faster.
-        """
-        first = last = 0.0
-        period = 1 / self.info.fps
-        index = 0
+    def count(self) -> int:
+        """How many frames are left."""
+        left = 0
         while self._capture.grab():
-            stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            if index == 0:
-                first = stamp if math.isfinite(stamp) else 0.0
-            seconds = stamp - first
-            if index and not (math.isfinite(seconds) and seconds > last + 1e-4):
-                seconds = last + period
-            if seconds + 2 * period < start:
-                yield seconds, None
-            else:
-                whole, picture = self._capture.retrieve()
-                if not whole:
-                    return
-                yield seconds, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            last = seconds
-            index += 1
+            left += 1
+        return left
 
     def close(self) -> None:
         """Closes the file."""
@@ -115,45 +74,6 @@ class VideoReader:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
-
-
-def resample(
-    stamped: Iterable[tuple[float, np.ndarray | None]],
-    *,
-    fps: float,
-    period: float,
-    start: float,
-    end: float,
-) -> Iterator[np.ndarray]:
-    """Brings frames with time stamps to a fixed rate: each shows what was on screen at its time.
-
-    Args:
-        stamped: (seconds, frame) in order; frames before ``start`` may be None.
-        fps: Rate wanted, frames per second.
-        period: How long the last frame stays on screen, seconds.
-        start: First moment wanted, seconds.
-        end: Last moment wanted, seconds (infinity: all there is).
-
-    Yields:
-        Frames, (H, W, 3).
-    """
-    # Half a millisecond of slack: WebM rounds its stamps to whole milliseconds.
-    slack = 0.6e-3
-    shown: np.ndarray | None = None
-    count, last = 0, -math.inf
-    for seconds, frame in stamped:
-        while shown is not None and start + count / fps < min(seconds - slack, end - slack):
-            yield shown
-            count += 1
-        if seconds >= end - slack:
-            return
-        shown = frame if frame is not None else shown
-        last = seconds
-    # The last frame stays for its own time; rounding keeps 240 frames 240.
-    stop = min(last + period, end)
-    while shown is not None and start + (count + 0.5) / fps <= stop:
-        yield shown
-        count += 1
 
 
 def write_webm(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> int:
@@ -208,7 +128,7 @@ def count_frames(path: Path) -> int:
         UserError: If the file is not a video.
     """
     with VideoReader(path) as reader:
-        return sum(1 for _ in reader.frames(start=math.inf))
+        return reader.count()
 
 
 def _mark_as_webm(path: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from onedemo.demos import sandboxed_decoder
+from onedemo.demos.decoder_child import shaped_frames
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
 from onedemo.errors import UserError
 from unit.demos.test_library import make_video, refused
@@ -74,7 +75,8 @@ def test_a_bomb_is_refused_without_growing(tmp_path, library, make, suffix, word
 def test_more_frames_than_anybody_needs(tmp_path, library, monkeypatch):
     monkeypatch.setattr("onedemo.demos.import_checks.MAX_FRAMES", 20)
     with pytest.raises(UserError, match="more than 20 frames"):
-        list(sandboxed_decoder.shaped_frames(make_video(tmp_path / "a.avi", count=30), Options()))
+        with make_video(tmp_path / "a.avi", count=30).open("rb") as file:
+            list(shaped_frames(file, "a.avi", Options()))
 
 
 def test_memory_processor_time_and_wall_time_are_limited(tmp_path, library):
@@ -98,7 +100,9 @@ def test_a_file_that_names_other_files_is_no_video(tmp_path, library, kind):
     else:
         path = tmp_path / "list.mp4"
         path.write_text("ffconcat version 1.0\nfile other.avi\n")
-    assert "is not a video" in refused(path, library)
+    assert "is a list of other files" in refused(path, library)
+    with pytest.raises(UserError, match="is not a video that can be read"):  # nor by the decoder itself
+        list(decode(path, Options()))
 
 
 def test_the_child_is_gone_when_nobody_wants_more(tmp_path):
@@ -112,7 +116,7 @@ def test_the_child_is_gone_when_nobody_wants_more(tmp_path):
 
 def _children():
     listing = [p.read_text() for p in Path("/proc").glob("[0-9]*/cmdline") if _mine(p.parent)]
-    return [line for line in listing if "onedemo.demos.sandboxed_decoder" in line]
+    return [line for line in listing if "onedemo.demos.decoder_child" in line]
 
 
 def _mine(process):
@@ -155,5 +159,5 @@ def test_the_child_knows_nothing_of_its_parent(tmp_path, monkeypatch):
         lambda command, **how: seen.update(how) or child(command, **how),
     )
     monkeypatch.setenv("SECRET", "x")
-    list(decode(make_video(tmp_path / "a.avi", count=3), Options()))
+    list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
     assert "SECRET" not in seen["env"] and seen.get("close_fds", True) and not seen.get("shell")
