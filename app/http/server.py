@@ -116,6 +116,7 @@ class Front:
             *(Route("GET", path, "stranger", files.login_static) for path in sorted(assets.PUBLIC)),
             Route("GET", "/", "annotator", self._home),
             Route("GET", r"/r/{rater:\d{1,9}}", "annotator", self._page_of),
+            Route("GET", r"/r/{rater:\d{1,9}}/session", "annotator", self._session),
             Route("POST", r"/r/{rater:\d{1,9}}/press", "annotator", self._press),
             Route("POST", r"/r/{rater:\d{1,9}}/do", "researcher", self._do),
             Route("GET", "/static/{name}", "annotator", files.static),
@@ -201,6 +202,10 @@ class Front:
             return await self._proxy.socket(request)
         return web.Response(text=self._html, content_type="text/html")
 
+    async def _session(self, request: web.Request) -> web.Response:
+        """What an open page asks while its live connection is down; whoever has no session gets 401."""
+        return web.Response(status=204)
+
     async def _health(self, request: web.Request) -> web.Response:
         status = self._page.trainer.status()
         healthy = status.phase != "failed"
@@ -210,7 +215,9 @@ class Front:
         body = await request.read()
         try:
             counted = await asyncio.to_thread(self._page.press, request[RATER].id, read_press(body))
-        except (PageGone, AnsweredElsewhere) as told:
+        except PageGone as told:
+            raise web.HTTPGone(text=str(told)) from None
+        except AnsweredElsewhere as told:
             raise web.HTTPConflict(text=str(told)) from None
         except ValueError as error:
             raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,9 +19,13 @@ GUARD_MS = 60
 
 
 @contextmanager
-def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[Any]:
-    """A page of a new browser profile, opened by a link, its header drawn."""
+def opened(
+    chromium, link: str, viewport=DESKTOP, scripts: Iterable[str] = (), **options: Any
+) -> Iterator[Any]:
+    """A page of a new browser profile, opened by a link, its header drawn; scripts run before its own."""
     context = chromium.new_context(viewport=viewport, **options)
+    for script in scripts:
+        context.add_init_script(script)
     page = context.new_page()
     page.goto(link)
     page.wait_for_selector(".od-header", timeout=30_000)
@@ -244,7 +248,9 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
                 lambda *_, **__: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")),
             )
             page.keyboard.press("3")
+            site.trainer.set_status(phase="failed", error="The disk is full.")
             page.wait_for_selector(".od-problem >> text=disk is full")
+            assert "kept" not in page.wait_for_selector(".od-banner").inner_text()
             assert page.locator(".od-clip .od-player").get_attribute("data-clip") == str(clip)
         site.trainer.set_status(phase="failed", error="The graphics memory is full.")
         page.wait_for_selector(".od-banner >> text=The graphics memory is full.")
