@@ -6,8 +6,10 @@
 (() => {
   "use strict";
   const { forget, main, toggleSlow, watchPlayers } = clips; // static/player.js
+  const { answers, settings } = line; // static/line.js
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
+  document.documentElement.toggleAttribute("data-dark", dark.matches);
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
@@ -19,6 +21,15 @@
 
   function typing(target) {
     return target instanceof Element && target.closest("input, textarea, select, [contenteditable=true]");
+  }
+
+  // What a key means: its label, but digits by their place, as French keyboards have them with Shift, and
+  // letters by their place where the label is of another script.
+  function labelled({ key, code }) {
+    const [, digit, letter] = /^(?:Digit(\d)|Key([A-Z]))$/.exec(code) ?? [];
+    if (digit) return digit;
+    const foreign = key === "Process" || (/\p{L}/u.test(key) && !/\p{Script=Latin}/u.test(key));
+    return letter && foreign ? letter.toLowerCase() : key;
   }
 
   // A key that Viser listens to, such as "alt+2".
@@ -40,55 +51,111 @@
   // What the server asks of whatever changes something: no other site can read it.
   const named = () => ({ "X-Onedemo-Page": shown(".od-header")?.dataset.page ?? "" });
 
+  class Refused extends Error {}
+  class PageGone extends Refused {}
+
   async function post(where, what, options = {}) {
-    const answer = await fetch(where, {
+    const answer = await line.request(where, {
       method: "POST",
       headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(what),
       ...options,
     });
-    if (answer.status === 401) throw new Error("This page is closed. Please open your link again.");
-    if (!answer.ok) throw new Error(await answer.text());
+    if (answer.status === 401) {
+      line.end(await line.reason(answer));
+      throw new line.Closed("This was not saved: this page is closed.");
+    }
+    if (answer.status === 410) throw new PageGone(await answer.text());
+    if (!answer.ok) throw new Refused(await answer.text());
     return answer;
   }
 
-  // Why the last answer did not count; it stays until the next one.
-  function say(text) {
+  // Why the last answer did not count, or not yet; it stays until the next one.
+  function say(text, late = false) {
     shown("body > .od-problem")?.remove();
     if (!text) return;
     const note = document.createElement("p");
-    note.className = "od-problem";
-    note.setAttribute("role", "alert");
+    note.className = late ? "od-problem od-late" : "od-problem";
+    note.setAttribute("role", late ? "status" : "alert");
     note.textContent = text;
     document.body.append(note);
   }
 
-  // Answers go one after another. A request that gets no answer is sent once more, under the same number,
-  // by which the server knows it.
-  let line = Promise.resolve();
+  const NOT_YET = "Not saved yet: the server does not answer. Your answer is kept here and sent again.";
+
+  // Presses without an answer, oldest first. They outlive a reload of the page.
+  const PRESSES = `onedemo-presses-${location.pathname}`;
+  const kept = {
+    read: () => JSON.parse(sessionStorage.getItem(PRESSES) ?? "[]"),
+    write: (bodies) => sessionStorage.setItem(PRESSES, JSON.stringify(bodies)),
+    add: (body) => kept.write([...kept.read(), body]),
+    remove: (body) => kept.write(kept.read().filter(({ id }) => id !== body.id)),
+  };
+
+  // Answers go one after another.
+  let queue = Promise.resolve();
   function send(press) {
     const id = [...crypto.getRandomValues(new Uint32Array(4))].join("-");
-    const body = { page: shown(".od-header").dataset.page, id, ...press };
-    line = line.then(() => deliver(body)).then(
-      (counted) => (say(""), counted),
-      (error) => (say(error.message), false),
-    );
-    return line;
+    const body = { page: pageName(), id, ...press };
+    kept.add(body);
+    return enqueue(body);
   }
 
-  async function deliver(body, tries = 2) {
+  function enqueue(body) {
+    queue = queue.then(() => deliver(body)).then(
+      (counted) => (kept.remove(body), say(""), counted),
+      (error) => (kept.remove(body), say(error.message), false),
+    );
+    return queue;
+  }
+
+  // Sends a press until it is answered, always under the same number, by which the server knows it.
+  async function deliver(body) {
+    const late = setTimeout(() => say(NOT_YET, true), settings.lateMs);
     try {
-      return (await (await post("press", body, { signal: AbortSignal.timeout(8000) })).json()).counted;
-    } catch (error) {
-      if (!["TypeError", "TimeoutError"].includes(error.name)) throw error; // it was answered
-      if (tries === 1)
-        throw new Error("There is no answer from the server: your last press may not have been saved. Look at what is on screen before you press again.");
+      for (;;) {
+        try {
+          return (await (await post("press", body)).json()).counted;
+        } catch (error) {
+          if (error instanceof PageGone && (await movesOn(body))) continue;
+          if (!line.unanswered(error)) throw error;
+          await answers();
+        }
+      }
+    } finally {
+      clearTimeout(late);
     }
-    await new Promise((go) => setTimeout(go, 500));
-    return deliver(body, tries - 1);
+  }
+
+  // The page at which it was pressed has gone, with its connection, before the press came: it counts at the
+  // new page if the same clip is on screen there.
+  async function movesOn(body) {
+    const about = body.clip ? "clip" : "pair";
+    if (!["rate", "skip", "compare"].includes(body.press) || body.answer === "undo") return false;
+    const there = await seen(() => pageName() !== body.page && main()?.ready && main());
+    if (!there || there.element.dataset[about] !== String(body[about])) return false;
+    body.page = pageName();
+    there.answered = true;
+    await new Promise((go) => setTimeout(go, 500)); // a press that comes at once was made for another clip
+    return true;
+  }
+
+  function pageName() {
+    return shown(".od-header")?.dataset.page;
+  }
+
+  // What a function gives, once it gives something; null if it does not in time.
+  async function seen(find, ms = 10000) {
+    for (const end = performance.now() + ms; performance.now() < end; ) {
+      const found = find();
+      if (found) return found;
+      await new Promise((go) => setTimeout(go, 100));
+    }
+    return null;
   }
 
   const PAIR = { 1: "left", 2: "equal", 3: "right", s: "skip" };
+  const DOUBLE_MS = 600;
   const PRACTICE = { g: "next", s: "leave" };
 
   // What "1" to "5", "s" or "g" say of what is on screen, if they say anything.
@@ -115,7 +182,11 @@
   }
 
   // Takes back what was answered a moment ago, or what the button says.
-  function undo() {
+  let undoneAt = -Infinity;
+  function undo(event) {
+    // The second half of a double click: the button says another clip by now.
+    if (event.type === "click" && event.timeStamp - undoneAt < DOUBLE_MS) return;
+    undoneAt = event.timeStamp;
     const player = main();
     const button = shown("[data-undo-clip], [data-undo-pair]");
     const { clip, pair } = player?.answered && !player.undone ? player.element.dataset : {};
@@ -150,36 +221,42 @@
   window.addEventListener(
     "keydown",
     (event) => {
-      if (typing(event.target) || event.ctrlKey || event.metaKey) return;
-      // Another tab begins at its top.
-      if (event.altKey && /^[0-9]$/.test(event.key)) shown(".mantine-Paper-root:has(.od-header)")?.scrollTo(0, 0);
-      // A browser clicks a button anew with each repeat of a held Enter.
-      if (event.key === "Enter" && event.repeat) return event.preventDefault();
+      if (typing(event.target) || event.ctrlKey || event.metaKey || event.getModifierState("AltGraph")) return;
+      const name = labelled(event);
       const stop = () => {
         event.stopImmediatePropagation();
         event.preventDefault();
       };
+      if (event.altKey) {
+        // Another tab begins at its top.
+        if (/^[0-9]$/.test(name)) shown(".mantine-Paper-root:has(.od-header)")?.scrollTo(0, 0);
+        if (!event.isTrusted || name.toLowerCase() === event.key.toLowerCase()) return;
+        stop();
+        return viserKey(`alt+${name}`);
+      }
+      // A browser clicks a button anew with each repeat of a held Enter.
+      if (name === "Enter" && event.repeat) return event.preventDefault();
       if (shown(".od-help[open]")) {
         // Nobody sees the clip now. Escape, Enter and Tab belong to the dialog.
         if (event.key === "?") shown(".od-help").close();
-        if (!["Escape", "Enter", "Tab"].includes(event.key)) stop();
+        if (!["Escape", "Enter", "Tab"].includes(name)) stop();
         return;
       }
-      const arrows = event.key.startsWith("Arrow");
+      const arrows = name.startsWith("Arrow");
       if (arrows && event.target.closest?.("[role=slider], [role=tablist]")) return;
-      const key = event.key === "Backspace" ? "u" : event.key.toLowerCase();
-      if (/^[1-5su]$/.test(key) && !event.altKey) {
+      const key = name === "Backspace" ? "u" : name.toLowerCase();
+      if (/^[1-5su]$/.test(key) && event.key !== "?") {
         event.preventDefault();
-        if (!event.repeat) key === "u" ? undo() : answer(key);
+        if (!event.repeat) key === "u" ? undo(event) : answer(key);
         return;
       }
-      if (event.key === "Enter" && shown("[data-go]") && !event.target.closest?.("button, a")) {
+      if (name === "Enter" && shown("[data-go]") && !event.target.closest?.("button, a")) {
         stop();
         if (!event.repeat) answer("g");
         return;
       }
       // On a button too: the space bar always replays. Enter presses a button.
-      if (!event.altKey && (arrows || !event.repeat ? local(event.key) : event.key === " ")) stop();
+      if (arrows || !event.repeat ? local(event.key === "?" ? "?" : name) : name === " ") stop();
     },
     true,
   );
@@ -196,7 +273,7 @@
     if (!button || button.disabled) return;
     const data = button.dataset;
     if (data.key?.startsWith("alt+")) viserKey(data.key);
-    else if (data.key === "u") undo();
+    else if (data.key === "u") undo(event);
     else if (data.key) answer(data.key);
     else if ("replay" in data) local(" ");
     else if ("slow" in data) local("f");
@@ -333,6 +410,7 @@
     request.onerror = () => done("The connection was lost during the upload. Please try again.");
     request.open("POST", form.dataset.upload);
     for (const [name, value] of Object.entries(named())) request.setRequestHeader(name, value);
+    line.during(new Promise((over) => (request.onloadend = over)));
     button.disabled = true;
     place.textContent = "Uploading";
     request.send(new FormData(form));
@@ -353,6 +431,14 @@
   ).observe(document.documentElement, { childList: true, subtree: true });
 
   watchPlayers();
+
+  // After a reload: what was on its way, and the tab that was open.
+  const tab = line.takeTab();
+  seen(pageName, 60000).then(async () => {
+    for (const body of kept.read()) enqueue(body);
+    const there = () => shown(`.od-tabs [data-key="${CSS.escape(tab)}"][aria-current]`);
+    for (let tries = 0; tab && tries < 3 && !(await seen(there, 500)); tries += 1) viserKey(tab);
+  });
 
   // Viser connects only with WebGL. Without it, say so instead of showing an empty page.
   function webgl() {

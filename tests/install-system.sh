@@ -5,7 +5,7 @@ set -u
 missing=""
 command -v chromium >/dev/null 2>&1 || command -v chromium-browser >/dev/null 2>&1 || missing="chromium"
 if [ "$(uname)" = Linux ]; then
-  for entry in libEGL.so.1:libegl1 libEGL_mesa.so.0:libegl-mesa0 libGLESv2.so.2:libgles2; do
+  for entry in libEGL.so.1:libegl1 libEGL_mesa.so.0:libegl-mesa0 libGLESv2.so.2:libgles2 libOSMesa.so.8:libosmesa6; do
     "${PYTHON:-.venv/bin/python}" -c "import ctypes; ctypes.CDLL('${entry%%:*}')" 2>/dev/null ||
       missing="$missing ${entry##*:} libgl1-mesa-dri"
   done

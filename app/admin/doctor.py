@@ -14,7 +14,6 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from packaging.requirements import Requirement
 
 from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos.library import list_demos
@@ -47,7 +46,7 @@ def examine(data_dir: Path) -> Iterator[Finding]:
         data_dir: May not be there yet: then only the installation is looked at.
     """
     checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
-        ("packages", _packages),
+        ("onedemo", _version),
         ("pictures", _pictures),
         ("image network", lambda: _encoder(data_dir)),
         ("disk", lambda: _disk(data_dir)),
@@ -67,26 +66,8 @@ def examine(data_dir: Path) -> Iterator[Finding]:
         yield Finding("database", True, f"none in {data_dir} yet")
 
 
-def _packages() -> Iterator[Finding]:
-    wrong = []
-    for line in metadata.requires("onedemo") or []:
-        wanted = Requirement(line)
-        if wanted.marker is not None and not wanted.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            there = metadata.version(wanted.name)
-        except metadata.PackageNotFoundError:
-            wrong.append(f"{wanted.name} is missing, {wanted.specifier} is needed")
-            continue
-        if not wanted.specifier.contains(there, prereleases=True):
-            wrong.append(f"{wanted.name} is {there}, {wanted.specifier} is needed")
-    python = sys.version.split()[0]
-    if wrong:
-        yield Finding("packages", False, f"{'; '.join(wrong)}: install onedemo again")
-    else:
-        yield Finding(
-            "packages", True, f"onedemo {metadata.version('onedemo')}, Python {python}, all as needed"
-        )
+def _version() -> Iterator[Finding]:
+    yield Finding("onedemo", True, f"{metadata.version('onedemo')}, Python {sys.version.split()[0]}")
 
 
 def _pictures() -> Iterator[Finding]:

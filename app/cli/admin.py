@@ -45,9 +45,19 @@ def restore(file: Path, /, *, data_dir: DataDir = DATA) -> None:
 
 def doctor(*, data_dir: DataDir = DATA) -> int:
     """What is wrong with installation and data, if anything."""
-    from onedemo.app.admin.doctor import examine
+    from onedemo.app.admin import environment
 
     wrong = 0
+    for fault in environment.faults():
+        wrong += 1
+        print(f"BAD  {'installation':16} {fault}", flush=True)
+    try:
+        from onedemo.app.admin.doctor import examine
+    except Exception:  # by what was said above
+        if not wrong:
+            raise
+        print("no more can be looked at before that is mended")
+        return 1
     for finding in examine(data_dir):
         wrong += not finding.ok
         print(f"{'ok  ' if finding.ok else 'BAD '} {finding.what:16} {finding.said}", flush=True)

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from cyclopts import App, Parameter
 
 from onedemo.app.cli.data import DATA, DataDir, Whole, open_store
+from onedemo.core.outputs import check_prefix
 
 baseline = App(name="baseline", help="What the method is compared with.")
 Prefix = Annotated[Path, Parameter(help="Where to write PREFIX.json, .policy.pt and .hidden.npz.")]
@@ -30,7 +31,9 @@ def trpo(
         device: Where the policy computes: cpu or cuda.
     """
     from onedemo.baselines.handcoded_trpo import HandcodedConfig, save_result, train_handcoded
+    from onedemo.baselines.scores import SAVED
 
+    check_prefix(out, SAVED)
     config = HandcodedConfig(
         task=task,
         steps=steps,
@@ -66,7 +69,9 @@ def preferences(
         stored_comparisons,
         train_preferences,
     )
+    from onedemo.baselines.scores import SAVED
 
+    check_prefix(out, SAVED)
     pretrain, online = split_comparisons(comparisons)
     config = PreferencesConfig(pretrain=pretrain, online=online, steps=steps, seed=seed)
     given = []

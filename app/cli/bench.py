@@ -13,7 +13,8 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from onedemo.app.cli.data import Whole
-from onedemo.core.files import check_writable, write_atomic
+from onedemo.core.files import write_atomic
+from onedemo.core.outputs import check_outputs
 from onedemo.errors import UserError
 from onedemo.experiments.registry import TABLES, TUNING_FROM, default_seeds, find_table, parse_seeds
 
@@ -86,8 +87,7 @@ def _table(name: str) -> Any:
             raise UserError(f"argument --seeds: {error}") from None
         if workers is not None and workers < 1:
             raise UserError(f"argument --workers: must be a whole number of at least 1, got '{workers}'")
-        _check_outputs(json_, out)
-        _check_directory("--results", results)
+        _check_outputs(json_, out, results)
         asked = find_table(name)
         jobs = asked.plan(numbers or default_seeds(asked, quick=quick), quick=quick)
         if report_only:
@@ -109,23 +109,11 @@ def _table(name: str) -> Any:
     return table
 
 
-def _check_outputs(file: Path | None, out: Path | None) -> None:
+def _check_outputs(file: Path | None, out: Path | None, results: Path | None = None) -> None:
     """Raises UserError now, and not after hours of work."""
-    if file is not None:
-        check_writable(file)
-    if out is not None:
-        _check_directory("--out", out)
-        if importlib.util.find_spec("matplotlib") is None:
-            raise UserError("--out needs matplotlib for its charts: pip install -e '.[bench]'")
-
-
-def _check_directory(option: str, directory: Path) -> None:
-    if directory.exists() and not directory.is_dir():
-        raise UserError(f"{option} {directory} is a file; give the name of a directory")
-    there = directory.absolute()
-    while not there.exists():
-        there = there.parent
-    check_writable(there / "report")
+    check_outputs(file, directories={"--out": out, "--results": results})
+    if out is not None and importlib.util.find_spec("matplotlib") is None:
+        raise UserError("--out needs matplotlib for its charts: pip install -e '.[bench]'")
 
 
 def _write_json(file: Path | None, record: dict[str, Any]) -> None:

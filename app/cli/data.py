@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
-from onedemo.core.files import check_writable
+from onedemo.core.outputs import check_outputs
 from onedemo.errors import UserError
 
 DATA = Path("data")
@@ -25,7 +25,7 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 
 def check_output(file: Path, data_dir: Path) -> None:
     """Raises UserError, before any work is done, if a result could not be written there."""
-    check_writable(file)
+    check_outputs(file)
     if file.absolute().parent == data_dir.absolute() and file.name.startswith("onedemo.sqlite3"):
         raise UserError(f"{file} is the database; choose another name")
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from cyclopts import App
 
 from onedemo.app.cli.data import DATA, DataDir
+from onedemo.core.outputs import check_data_dir
 from onedemo.errors import UserError
 
 demo = App(name="demo", help="Bring in and look at demonstration videos.")
@@ -36,6 +37,7 @@ def add(
     except ValueError as error:
         raise UserError(f"argument --crop: {error}") from None
     demos_dir = data_dir / "demos"
+    check_data_dir(demos_dir)
     added = import_video(
         video, name=name, demos_dir=demos_dir, start=start, end=end, crop=rectangle, mirror=mirror, fps=fps
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
+from onedemo.app.admin import environment
 from onedemo.core.process import prepare_process
 from onedemo.errors import UserError
 
@@ -54,6 +56,10 @@ _COMMANDS = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line and returns the exit code: 0, or 2 for bad input."""
+    _speak_any_terminal()
+    if said := environment.unsupported():
+        print(f"onedemo: {said}", file=sys.stderr)
+        return 2
     prepare_process()
     words = sys.argv[1:] if argv is None else list(argv)
     try:
@@ -74,16 +80,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"onedemo: {error}", file=sys.stderr)
         return 2
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in _APP_ONLY:
-            raise
-        print(f"onedemo: {error.name} is not installed: pip install 'onedemo[app]'", file=sys.stderr)
-        return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the reader of our output has gone (head, less)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except Exception as error:  # a broken installation fails anywhere, and in any way
+        said = _what_is_missing(error)
+        if not said:
+            raise
+        print(f"onedemo: {said}", file=sys.stderr)
+        return 2
+
+
+def _speak_any_terminal() -> None:
+    """A name that the terminal's character set lacks is written with its number, and ends no command."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _what_is_missing(error: Exception) -> str:
+    """What is wrong with the installation, if that may be why something failed; else ""."""
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] in _APP_ONLY:
+        return f"{error.name} is not installed: pip install 'onedemo[app]'"
+    said = "; ".join(environment.faults())
+    return f"{said} (after {type(error).__name__}: {error})" if said else ""
 
 
 def _app() -> App:

@@ -58,7 +58,7 @@ def list_(*, data_dir: DataDir = DATA) -> None:
 def links(*, data_dir: DataDir = DATA) -> None:
     """All links and what has become of them, not the links themselves."""
     with open_store(data_dir, must_exist=True) as store:
-        heads = ("link", "rater", "role", "state", "once", "made", "expires", "last used")
+        heads = ("link", "rater", "role", "state", "once", "made (UTC)", "expires (UTC)", "last used (UTC)")
         rows = [
             (str(link.id), link.rater.name, link.rater.role, link.state, "once" if link.once else "-",
              *(time[:16].replace("T", " ") if time else "-"
@@ -111,4 +111,4 @@ def audit(*, csv: Path | None = None, data_dir: DataDir = DATA) -> None:
             write_atomic(csv, csv_blocks(store.audit.lines(), AUDIT_COLUMNS))
             return
         for at, who, what, detail in store.audit.lines():
-            print(f"{at[:19].replace('T', ' ')}  {who:24} {what}{': ' if detail else ''}{detail}")
+            print(f"{at[:19].replace('T', ' ')} UTC  {who:24} {what}{': ' if detail else ''}{detail}")

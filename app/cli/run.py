@@ -89,7 +89,7 @@ def serve(
     from onedemo.demos.library import find_demo
 
     listening = Listening(
-        host=host, port=port, tls_cert=tls_cert, tls_key=tls_key,
+        host=host.removeprefix("[").removesuffix("]"), port=port, tls_cert=tls_cert, tls_key=tls_key,
         behind_proxy=behind_proxy, names=tuple(allow_host or ()),
         base_path=base_path.rstrip("/"),
     )  # fmt: skip

@@ -298,7 +298,9 @@ class Front:
             try:
                 press = read_press(await read_body(request))
                 counted = await self._in_turn(self._pressing, self._page.press, rater, press)
-            except (PageGone, AnsweredElsewhere) as told:
+            except PageGone as told:
+                raise web.HTTPGone(text=str(told)) from None
+            except AnsweredElsewhere as told:
                 raise web.HTTPConflict(text=str(told)) from None
             except ValueError as error:
                 raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None

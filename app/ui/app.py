@@ -18,7 +18,7 @@ import rich
 import viser
 
 from onedemo.app.annotation.assignment import Again, Assignment
-from onedemo.app.annotation.presses import PageGone, Press
+from onedemo.app.annotation.presses import PageGone, Press, Rate, Skip
 from onedemo.app.annotation.rating_session import GUARD_SECONDS
 from onedemo.app.annotation.tutorial import Lesson
 from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER
@@ -36,6 +36,8 @@ log = logging.getLogger("onedemo.page")
 
 TICK_SECONDS = 0.5
 """How often counters, waiting states and curves are looked at."""
+_LOOKED_BACK = 20
+"""Events of a rater among which is one that was given at a page that has gone."""
 
 
 class Page:
@@ -102,7 +104,7 @@ class Page:
         self._server.stop()
 
     def press(self, rater_id: int, press: Press) -> bool:
-        """Carries out what somebody pressed at one of their pages; whether it counted.
+        """Carries out what somebody pressed at one of their pages; whether it counts, now or already.
 
         Raises:
             PageGone: If no page of the rater goes by that name.
@@ -110,9 +112,13 @@ class Page:
         """
         if session := self._open(rater_id, press.page):
             return session.press(press)
+        kind = {Rate: "rate", Skip: "skip"}.get(type(press))
+        if kind is not None:  # its answer may have been lost with the page
+            said = self.trainer.store.ratings.answered(self.trainer.run, _LOOKED_BACK, rater_id=rater_id)
+            if any((last.clip, last.kind) == (press.clip, kind) for last in said):
+                return True
         raise PageGone(
-            "This page had lost its connection. Look at the clip that is shown now: "
-            "your last answer may have been saved."
+            "Your last answer was not saved: the connection was lost, and something else is shown now."
         )
 
     def is_open(self, rater_id: int, token: str) -> bool:

@@ -375,7 +375,7 @@ def test_a_clip_that_somebody_else_holds_cannot_be_rated(site):
             await asyncio.sleep(0.7)
             rating = {"press": "rate", "clip": cy.clip, "value": 3}
             assert await bo.post(**rating) == (200, '{"counted": false}')
-            assert (await bo.post(**rating, page=cy.token))[0] == 409
+            assert (await bo.post(**rating, page=cy.token))[0] == 410
             await asyncio.sleep(0.7)
             assert cy.clip == before
             for tab in (bo, cy):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,20 +23,26 @@ _left: list[Any] = []
 
 
 @contextmanager
-def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[Any]:
+def opened(
+    chromium, link: str, viewport=DESKTOP, scripts: Iterable[str] = (), **options: Any
+) -> Iterator[Any]:
     """A page opened by a link, its header drawn: that of a new browser profile as far as anybody can tell.
 
-    With options of ``browser.new_context`` it is a new one; else cookies, stores and routes are cleared
-    afterwards, and the next takes it over. What else is set of page or context needs an option, too.
+    With scripts, which run before its own, or options of ``browser.new_context`` it is a new one; else
+    cookies, stores and routes are cleared afterwards, and the next takes it over. What else is set of page
+    or context needs an option, too.
     """
-    page = _left.pop() if _left and not options else chromium.new_context(**options).new_page()
+    new = bool(scripts or options)
+    page = _left.pop() if _left and not new else chromium.new_context(**options).new_page()
+    for script in scripts:
+        page.context.add_init_script(script)
     page.set_viewport_size(viewport)
     page.goto(link)
     page.wait_for_selector(".od-header", timeout=30_000)
     kept = False
     try:
         yield page
-        kept = not options
+        kept = not new
     finally:
         if kept:
             _leave(page)
@@ -270,7 +276,9 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
                 lambda *_, **__: (_ for _ in ()).throw(sqlite3.OperationalError("disk is full")),
             )
             page.keyboard.press("3")
+            site.trainer.set_status(phase="failed", error="The disk is full.")
             page.wait_for_selector(".od-problem >> text=disk is full")
+            assert "kept" not in page.wait_for_selector(".od-banner").inner_text()
             assert page.locator(".od-clip .od-player").get_attribute("data-clip") == str(clip)
         site.trainer.set_status(phase="failed", error="The graphics memory is full.")
         page.wait_for_selector(".od-banner >> text=The graphics memory is full.")

@@ -142,19 +142,20 @@ def test_a_mark_is_there_again_after_another_tab_after_undo_and_on_the_last_pict
         assert marks_of(site) == [(clip, 2, 38, 41), (clip, 1, 38, 41)]
 
 
-def test_a_press_that_does_not_arrive_says_so_and_loses_nothing(chromium, site):
+def test_a_press_that_does_not_arrive_says_so_and_is_sent_until_it_does(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         clip = shown_clip(page)
-        page.route("**/press", lambda route: route.abort())
+        page.route("**/r/**", lambda route: route.abort())
         mark_by_dragging(page, 0.05, 0.15)
         page.keyboard.press("2")
-        page.wait_for_selector(".od-problem >> text=There is no answer from the server")
+        page.wait_for_selector(".od-problem.od-late >> text=Not saved yet")
         assert site.events() == []
         assert page.locator(".od-wrong").bounding_box()["width"] > 10  # still there
-        page.unroute("**/press")
-        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", clip, 4, "bo")
-        assert marks_of(site) == [(clip, 4, 0, 9)]
+        page.unroute("**/r/**")
         page.wait_for_selector(".od-problem", state="detached")
+        assert marks_of(site) == [(clip, 2, 0, 9)]
+        second = shown_clip(page)
+        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", second, 4, "bo")
 
 
 def test_a_press_whose_answer_is_lost_is_sent_again_and_counts_once(chromium, site):
@@ -216,6 +217,68 @@ def test_a_held_enter_on_a_button_gives_one_rating(chromium, site):
         page.keyboard.up("Enter")
         page.wait_for_timeout(GUARD_MS)
         assert site.events() == [("rate", clip, 4, "bo")]
+
+
+def test_digits_are_keys_by_their_place(chromium, site):
+    keys = [  # of French, Czech and programmers' Dvorak keyboards, French with Shift, and the keypad
+        (4, "Digit4", "'", 52, 0), (2, "Digit2", "ě", 50, 0), (1, "Digit1", "%", 49, 0),
+        (3, "Digit3", "3", 51, 8), (5, "Numpad5", "5", 101, 0),
+    ]  # fmt: skip
+    with opened(chromium, site.links["annotator"]) as page:
+        for _, *key in keys:
+            shown_clip(page)
+            press_and_wait(page, site, lambda key=key: type_key(page, *key))
+        assert [event[2] for event in site.events()] == [key[0] for key in keys]
+        shown_clip(page)
+        type_key(page, "Digit2", "~", 50, modifiers=1 | 2)  # AltGr of Windows: another sign
+        page.wait_for_timeout(GUARD_MS)
+        assert len(site.events()) == len(keys)
+
+
+def test_letters_of_other_scripts_are_keys_by_their_place_and_latin_ones_by_their_label(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        press_and_wait(page, site, lambda: type_key(page, "KeyS", "ы", 83))
+        press_and_wait(page, site, lambda: type_key(page, "KeyU", "г", 85))
+        assert shown_clip(page) == clip
+        type_key(page, "KeyF", "а", 70)
+        page.wait_for_selector('[data-slow][aria-pressed="true"]')
+        press_and_wait(page, site, lambda: type_key(page, "Semicolon", "s", 83))  # Dvorak
+        shown_clip(page)
+        for code, key in (("KeyS", "o"), ("KeyU", "g"), ("KeyS", ";")):  # labels that mean nothing here
+            type_key(page, code, key, 79)
+        page.wait_for_timeout(GUARD_MS)
+        assert [event[0] for event in site.events()] == ["skip", "undo", "skip"]
+        type_key(page, "Digit2", "é", 50, modifiers=1)  # Alt: the second tab
+        page.wait_for_selector('.od-header[data-tab="guide"]')
+        type_key(page, "KeyA", "ф", 65, modifiers=1)
+        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
+
+
+def type_key(page, code, key, number, modifiers=0):
+    """A real key press of another layout, as the browser gets it from the system."""
+    devtools = page.context.new_cdp_session(page)
+    what = {"code": code, "key": key, "windowsVirtualKeyCode": number, "modifiers": modifiers}
+    devtools.send("Input.dispatchKeyEvent", {"type": "rawKeyDown", **what})
+    devtools.send("Input.dispatchKeyEvent", {"type": "keyUp", **what})
+    devtools.detach()
+
+
+def test_a_double_click_on_undo_takes_back_one(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        for _ in range(2):
+            clip = shown_clip(page)
+            press_and_wait(page, site, lambda: page.keyboard.press("4"))
+        undo = page.locator('.od-tools [data-key="u"]')
+        box = undo.bounding_box()
+        at = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.click(*at)
+        until(lambda: page.wait_for_timeout(20) or undo.get_attribute("data-undo-clip") != str(clip))
+        page.mouse.click(*at)
+        page.wait_for_timeout(700)
+        assert [event[:2] for event in site.events()][2:] == [("undo", clip)]
+        page.mouse.click(*at)  # a moment later it is meant
+        until(lambda: page.wait_for_timeout(20) or len(site.events()) == 4)
 
 
 def test_a_mark_by_keys_and_taking_it_away(chromium, site):
@@ -389,8 +452,8 @@ def test_presses_of_others_pages_and_hostile_ones_change_nothing(chromium, site)
             return page.request.post(f"{site.url}{path}", data=body, headers={"Origin": site.url}, **options)
 
         good = {"press": "rate", "page": token(page), "id": "1", "clip": clip, "value": 3, "mark": [0, 3]}
-        assert post({**good, "page": "guessed"}).status == 409
-        assert post({**good, "page": token(other), "clip": others_clip}).status == 409  # not this rater's
+        assert post({**good, "page": "guessed"}).status == 410
+        assert post({**good, "page": token(other), "clip": others_clip}).status == 410  # not this rater's
         for other_clip in (clip + 5, others_clip, 10**9):
             assert post({**good, "id": str(other_clip), "clip": other_clip}).json() == {"counted": False}
         reason = {"press": "reason", "page": token(page), "id": "2", "clip": clip, "reason": "not skipped"}
@@ -414,4 +477,6 @@ def test_presses_of_others_pages_and_hostile_ones_change_nothing(chromium, site)
         for _ in range(3):  # sent again, it counts once
             assert post({**good, "id": "9"}).json() == {"counted": True}
         assert site.events() == [("rate", clip, 3, "bo")] and marks_of(site) == [(clip, 3, 0, 13)]
+        # What was saved is, though the page at which it was pressed has gone.
+        assert post({**good, "page": "gone", "id": "10"}).json() == {"counted": True}
         page.wait_for_selector(f'.od-clip [data-clip]:not([data-clip="{clip}"])')  # drawn by Viser

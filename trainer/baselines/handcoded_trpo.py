@@ -16,8 +16,9 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from onedemo.baselines.scores import Score, measure, save_training
+from onedemo.baselines.scores import SAVED, Score, measure, save_training
 from onedemo.core.cpu import cores
+from onedemo.core.outputs import check_prefix
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
 from onedemo.rl.policy import Policy, PolicyConfig, check_device
@@ -179,6 +180,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--gamma", type=float, default=TrpoConfig().gamma)
     parser.add_argument("--evaluate-every", type=int, default=10, help="iterations")
     args = parser.parse_args(argv)
+    check_prefix(args.out, SAVED)
     config = HandcodedConfig(
         task=args.task,
         steps=args.steps,

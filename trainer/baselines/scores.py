@@ -75,6 +75,10 @@ def measure(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tup
     return score, episode
 
 
+SAVED = (SUFFIX, ".policy.pt", ".json")
+"""What the names of the files of a training end in, after its prefix."""
+
+
 def save_training(
     prefix: Path,
     *,
@@ -94,11 +98,12 @@ def save_training(
         episode: One of its episodes.
         **scores: Evaluations to name in the JSON file, beside the curve.
     """
-    save_hidden(prefix.with_name(prefix.name + SUFFIX), episode)
-    torch.save(policy.to_dict(), prefix.with_name(prefix.name + ".policy.pt"))
+    hidden, weights, scored = (prefix.with_name(prefix.name + suffix) for suffix in SAVED)
+    save_hidden(hidden, episode)
+    torch.save(policy.to_dict(), weights)
     report = {
         "config": asdict(config),
         **{name: asdict(score) for name, score in scores.items()},
         "curve": [asdict(score) for score in curve],
     }
-    prefix.with_name(prefix.name + ".json").write_text(json.dumps(report, indent=2) + "\n")
+    scored.write_text(json.dumps(report, indent=2) + "\n")

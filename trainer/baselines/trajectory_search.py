@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from onedemo.core.outputs import check_prefix
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
@@ -277,6 +278,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--out", type=Path, required=True, help="prefix of the file to write")
     args = parser.parse_args(argv)
+    check_prefix(args.out, (SUFFIX,))
     options = {k: v for k, v in vars(args).items() if k != "out"}
     hidden = optimise_flips(FlipPlan(**options))
     save_hidden(args.out.with_name(args.out.name + SUFFIX), hidden)

@@ -153,15 +153,6 @@ def jpeg_fault(data: bytes) -> str:
 _SEAL = b"onedemo crc32 %08x"
 
 
-def check_writable(file: Path) -> None:
-    """Raises UserError, before any work is done, if a file could not be written there."""
-    if file.is_dir():
-        raise UserError(f"{file} is a directory; give the name of a file in it")
-    parent = file.absolute().parent
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise UserError(f"cannot write {file}: {parent} is not a directory that can be written to")
-
-
 @contextmanager
 def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Holds a lock file: one process at a time, released when it ends, however it ends.

@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import time
+from typing import Literal
 
 GL_OFF = ("disable", "disabled", "off", "false", "0")
 """Values of ``MUJOCO_GL`` that turn pictures off."""
@@ -20,7 +21,7 @@ GL_OFF = ("disable", "disabled", "off", "false", "0")
 def prepare_process() -> None:
     """Sets the environment variables that NumPy, MuJoCo and OpenCV read; those set by the user stay.
 
-    The exception is ``MUJOCO_GL``: see ``choose_backend``.
+    The exceptions are ``MUJOCO_GL`` and ``PYOPENGL_PLATFORM``: see ``choose_backend``.
     """
     # NumPy's matrix products here are small: threads of its own would only compete with the physics'.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -30,12 +31,14 @@ def prepare_process() -> None:
 
 
 def choose_backend() -> str:
-    """Sets ``MUJOCO_GL``: EGL where its library loads, else off. Call before importing MuJoCo.
+    """Sets ``MUJOCO_GL`` to what draws: EGL, OSMesa if the user asks for it, "disable" where it is missing.
 
-    MuJoCo reads ``MUJOCO_GL`` once, at its first import, and where that names a library that is not
-    there the *import* dies with a bare AttributeError. So only "off" is taken from the user. Physics then
+    Call before importing MuJoCo, which reads ``MUJOCO_GL`` once, at its first import, and where that names a
+    library that is not there the *import* dies with a bare AttributeError. So only "off" and "osmesa"
+    (drawing in software, for machines on which EGL does not work) are taken from the user. Physics then
     works on any machine, and only pictures need the library; where they are off,
-    ``render.gl_context.open_context`` says why.
+    ``render.gl_context.open_context`` says why. ``PYOPENGL_PLATFORM`` is set to the same: MuJoCo refuses
+    any other.
 
     Returns:
         The value of ``MUJOCO_GL``; "" on systems whose own window library needs no choice.
@@ -43,17 +46,9 @@ def choose_backend() -> str:
     wanted = os.environ.get("MUJOCO_GL", "")
     if sys.platform != "linux" or wanted.lower() in GL_OFF:
         return wanted
-    os.environ["MUJOCO_GL"] = "egl" if libegl_loads() else "disable"
+    library = os.environ["PYOPENGL_PLATFORM"] = gl_library()
+    os.environ["MUJOCO_GL"] = library if gl_loads(library) else "disable"
     return os.environ["MUJOCO_GL"]
-
-
-def libegl_loads() -> bool:
-    """Whether the library that draws without a screen can be loaded (Linux)."""
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return False
-    return True
 
 
 def end_within(seconds: float, code: int = 0) -> None:
@@ -72,3 +67,20 @@ def end_within(seconds: float, code: int = 0) -> None:
         os._exit(code)
 
     threading.Thread(target=end, name="onedemo-end", daemon=True).start()
+
+
+def gl_library() -> Literal["egl", "osmesa"]:
+    """What draws without a screen on Linux, as ``MUJOCO_GL`` says, or said before it was switched off."""
+    gl, platform = (os.environ.get(name, "").lower() for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"))
+    return "osmesa" if gl == "osmesa" or (gl == "disable" and platform == "osmesa") else "egl"
+
+
+def gl_loads(library: Literal["egl", "osmesa"]) -> bool:
+    """Whether that library can be loaded."""
+    for name in {"egl": ("libEGL.so.1",), "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6")}[library]:
+        try:
+            ctypes.CDLL(name)
+            return True
+        except OSError:
+            continue
+    return False

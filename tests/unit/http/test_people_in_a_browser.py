@@ -1,4 +1,4 @@
-"""Cookies, sessions and pages of the front, without Viser and trainer behind it: sockets, SQLite, no browser."""
+"""Cookies, sessions and pages of the front, without Viser and trainer: sockets and SQLite, no browser."""
 
 from __future__ import annotations
 

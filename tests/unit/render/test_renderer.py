@@ -303,7 +303,7 @@ for make in (Renderer, RenderThread):
 
 
 def draw_elsewhere(before=(), **environment):
-    clean = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    clean = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
     done = subprocess.run(
         [*before, sys.executable, "-c", _DRAW],
         cwd=REPO,
@@ -337,6 +337,47 @@ def test_without_the_egl_library_physics_still_works_and_one_sentence_names_it(t
     lines = draw_elsewhere(before)
     assert len(lines) == 2
     assert "libEGL.so.1 is not installed" in lines[0] and "apt-get install libegl1" in lines[0]
+
+
+@pytest.mark.seam
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is how Linux draws without a screen")
+@pytest.mark.parametrize("device", ["3", "abc"])
+def test_a_wrong_egl_device_is_named(device):
+    lines = draw_elsewhere(MUJOCO_EGL_DEVICE_ID=device)
+    assert f"MUJOCO_EGL_DEVICE_ID={device} is not the number of a device" in lines[0]
+    assert "unset it" in lines[0] and "apt-get" not in lines[0]
+
+
+@pytest.mark.seam
+@pytest.mark.skipif(sys.platform != "linux", reason="EGL is how Linux draws without a screen")
+def test_software_draws_the_same_where_egl_does_not_work(tmp_path):
+    from onedemo.core.process import gl_loads
+
+    without = {"__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
+    assert "apt-get install libosmesa6, and set MUJOCO_GL=osmesa" in draw_elsewhere(**without)[0]
+    if not gl_loads("osmesa"):
+        assert "apt-get install libosmesa6" in draw_elsewhere(**without, MUJOCO_GL="osmesa")[0]
+        pytest.skip("there is no OSMesa: install the package libosmesa6")
+    code = (
+        "import sys, numpy as np\nfrom onedemo.core.process import prepare_process\nprepare_process()\n"
+        "from onedemo.render.renderer import Renderer, RenderThread\n"
+        "qpos = np.array([[0, 1.25, 0, 0, 0, 0.0]])\n"
+        "with Renderer() as own, RenderThread() as other:\n"  # two contexts, of two threads
+        "    pictures = [own.render(qpos), other.render(qpos).result(), own.render(qpos)]\n"
+        "np.save(sys.argv[1], np.concatenate(pictures))"
+    )
+    drawn = []
+    for name, environment in (
+        ("egl", {"PYOPENGL_PLATFORM": "osmesa"}),  # of somebody's shell; it is not asked
+        ("osmesa", without | {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "egl"}),
+    ):
+        command = [sys.executable, "-c", code, str(tmp_path / name)]
+        clean = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+        done = subprocess.run(command, cwd=REPO, env=clean | environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        drawn.append(np.load(tmp_path / f"{name}.npy").astype(int))
+    assert drawn[0].std() > 5 and np.abs(drawn[0] - drawn[1]).max() <= 2
+    assert all((pictures == pictures[0]).all() for pictures in drawn)
 
 
 def test_pictures_turned_off_by_the_user_say_so():
