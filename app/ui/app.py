@@ -29,7 +29,7 @@ from onedemo.app.ui import data_tab, guide_tab, rate_tab, runs_tab, watch_tab
 from onedemo.app.ui.compare_tab import Compare
 from onedemo.app.ui.context import TabContext
 from onedemo.app.ui.session import Session, TabMaker
-from onedemo.app.ui.viser_private import hang_up, lock_down, request_headers
+from onedemo.app.ui.viser_private import hang_up, lock_down, request_headers, start_server
 from onedemo.types import Rater
 
 log = logging.getLogger("onedemo.page")
@@ -70,7 +70,7 @@ class Page:
         rich.get_console().quiet = True  # Viser prints boxes through it, and addresses nobody should open.
         # A browser may leave while something is on its way to it; Viser warns of that each time.
         warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
-        self._server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        self._server = start_server(self._is_front)
         self.port: int = self._server.get_port()
         lock_down(self._server)
         self._server.on_client_connect(self._connect)
@@ -135,7 +135,7 @@ class Page:
 
     def _connect(self, client: viser.ClientHandle) -> None:
         headers = request_headers(self._server, client.client_id)
-        if not hmac.compare_digest(headers.get(SECRET_HEADER, "").encode(), self.secret.encode()):
+        if not self._is_front(headers):
             hang_up(self._server, client.client_id)
             return
         rater = self._rater(int(headers[RATER_HEADER]))
@@ -153,6 +153,9 @@ class Page:
             self._sessions[client.client_id] = session
         if client.client_id not in self._server.get_clients():
             self._disconnect(client)  # It left while its page was being built.
+
+    def _is_front(self, headers: Any) -> bool:
+        return hmac.compare_digest(headers.get(SECRET_HEADER, "").encode(), self.secret.encode())
 
     def _context(self, client: viser.ClientHandle, rater: Rater, *, dark: bool) -> TabContext:
         trainer, lesson = self.trainer, Lesson()

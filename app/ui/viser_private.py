@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from http import HTTPStatus
 from typing import Any
 
 import viser
+import websockets.asyncio.server
 from viser import _messages
 
 MESSAGES_LET_IN: tuple[type, ...] = (
@@ -15,6 +17,31 @@ MESSAGES_LET_IN: tuple[type, ...] = (
     _messages.CommandTriggerMessage,
 )
 """What a browser may say: where it looks from, a slider moved, a key pressed. Nothing else."""
+
+
+def start_server(may_connect: Callable[[Any], bool]) -> viser.ViserServer:
+    """Viser, on a free port of the loopback, which answers nothing but 403 to whoever may not connect.
+
+    Viser itself lets any page in the machine's browser open its socket, and serves files over the same port.
+
+    Args:
+        may_connect: Judges by the headers of a request.
+    """
+    serve = websockets.asyncio.server.serve
+
+    def guarded(*args: Any, process_request: Callable, **options: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            if may_connect(request.headers):
+                return process_request(connection, request)
+            return connection.respond(HTTPStatus.FORBIDDEN, "")
+
+        return serve(*args, process_request=check, **options)
+
+    websockets.asyncio.server.serve = guarded  # type: ignore[misc, assignment]
+    try:  # it has called it when it is made
+        return viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    finally:
+        websockets.asyncio.server.serve = serve  # type: ignore[misc]
 
 
 def lock_down(server: viser.ViserServer) -> None:

@@ -28,42 +28,21 @@ def test_nobody_can_talk_to_the_server_as_a_whole(site):
     assert site.page._server._websock_server._incoming_handlers == {}
 
 
-def test_direct_connection_gets_no_page(site):
+@pytest.mark.parametrize("origin", [None, "http://evil.example", "own"])
+def test_whoever_does_not_come_through_the_front_gets_nothing(site, origin):
+    """Neither a socket nor a file: any page in a browser of this machine can reach the port."""
+    url = f"http://127.0.0.1:{site.page.port}/"
+    headers = {} if origin is None else {"Origin": url[:-1] if origin == "own" else origin}
+
     async def go():
         async with aiohttp.ClientSession() as session:
-            async with session.ws_connect(
-                f"http://127.0.0.1:{site.page.port}/", protocols=[f"viser-v{viser.__version__}"]
-            ) as socket:
-                # A camera message is what makes Viser count a client as connected.
-                await socket.send_bytes(camera_message())
-                while True:
-                    message = await socket.receive(timeout=5)
-                    if message.type is aiohttp.WSMsgType.CLOSE:
-                        return message.data
-                    assert message.type is aiohttp.WSMsgType.BINARY
-                    assert b"od-header" not in message.data
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await session.ws_connect(url, protocols=[f"viser-v{viser.__version__}"], headers=headers)
+            async with session.get(url, headers=headers) as answer:
+                return refused.value.status, answer.status, await answer.read()
 
-    assert run(go()) == 1008
+    assert run(go()) == (403, 403, b"")
     assert not site.page._sessions
-
-
-def camera_message() -> bytes:
-    import msgspec
-
-    return msgspec.msgpack.encode(
-        {
-            "type": "ViewerCameraMessage",
-            "wxyz": [1.0, 0.0, 0.0, 0.0],
-            "position": [0.0, -3.0, 1.0],
-            "fov": 0.8,
-            "near": 0.01,
-            "far": 100.0,
-            "image_height": 480,
-            "image_width": 640,
-            "look_at": [0.0, 0.0, 1.0],
-            "up_direction": [0.0, 0.0, 1.0],
-        }
-    )
 
 
 def test_roles_get_their_tabs():

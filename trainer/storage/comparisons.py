@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from onedemo.storage.database import Database, now
-from onedemo.storage.ratings import AlreadyAnswered
+from onedemo.storage.ratings import LOOKED_BACK, AlreadyAnswered
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
 from onedemo.types import Segment
 
@@ -150,10 +150,15 @@ class Comparisons:
             return cursor.lastrowid
 
     def last_compared(self, run: str, rater_id: int) -> int | None:
-        """The pair that a rater answered or skipped last in a run, of those that hold, or None."""
+        """The pair that a rater answered or skipped last in a run, of those that hold, or None.
+
+        Only among the rater's last 400 answers.
+        """
         rows = self._database.rows(
             "SELECT c.pair_id FROM comparisons c JOIN pairs p ON p.id = c.pair_id"
-            " WHERE c.rater_id = ?1 AND p.run = ?2 AND c.answer != 'undo' AND NOT EXISTS ("
+            " WHERE c.rater_id = ?1 AND p.run = ?2 AND c.answer != 'undo'"
+            " AND c.id > COALESCE((SELECT id FROM comparisons WHERE rater_id = ?1 ORDER BY id DESC LIMIT 1"
+            f"  OFFSET {LOOKED_BACK}), 0) AND NOT EXISTS ("
             "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
             "  AND l.id > c.id) ORDER BY c.id DESC LIMIT 1",
             (rater_id, run),

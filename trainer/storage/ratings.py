@@ -20,6 +20,8 @@ SKIP_COLUMNS = (
     "demo_step", "steps", "repeat",
 )  # fmt: skip
 """Of a skip, in order."""
+LOOKED_BACK = 400
+"""Events of a rater among which what may be taken back is looked for: every open page asks twice a second."""
 MOST_REASON = 200
 """Characters of the reason for a skip."""
 
@@ -202,13 +204,14 @@ class Ratings:
     def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
         """The rating or skip that a rater gave last in a run, of those that hold; None if there is none.
 
-        Only of clips that can be shown again: those of an import have no picture.
+        Only among the rater's last 400 events, and only of clips that can be shown again: those of an import have no picture.
         """
         rows = self._database.rows(
             "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
             " JOIN clips c ON c.id = e.clip_id"
             " WHERE e.rater_id = ?1 AND c.run = ?2 AND c.state = 'ready' AND e.kind IN ('rate', 'skip')"
-            " AND NOT EXISTS ("
+            " AND e.id > COALESCE((SELECT id FROM events WHERE rater_id = ?1 ORDER BY id DESC LIMIT 1"
+            f"  OFFSET {LOOKED_BACK}), 0) AND NOT EXISTS ("
             "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
             "  AND l.repeat = e.repeat AND l.id > e.id) ORDER BY e.id DESC LIMIT 1",
             (rater_id, run),

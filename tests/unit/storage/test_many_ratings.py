@@ -47,6 +47,22 @@ def test_the_page_and_a_press_cost_the_same_with_forty_times_the_ratings(store):
     assert steps_of(store, store.database.rows, "SELECT COUNT(*) FROM ratings") > 20_000
 
 
+def test_what_an_open_page_asks_twice_a_second_costs_little_in_another_run_too(store):
+    """A rater who has rated much in one run has nothing to take back in the next: it was looked for in all."""
+
+    def ask():
+        assert store.ratings.last_answer("next", 1) is None
+        assert store.comparisons.last_compared("next", 1) is None
+        assert store.ratings.count_for_training("next") == 0
+
+    store.runs.add(run="next", demo="d", demo_sha256="0", seed=0, config="", version="0")
+    _fill(store.path, 0, 50 * 1_000)
+    small = steps_of(store, ask)
+    _fill(store.path, 50 * 1_000, 50 * 5_000)
+    assert steps_of(store, ask) < 1.2 * small
+    assert store.ratings.last_answer(_RUN, 1) is not None
+
+
 def test_a_csv_takes_no_memory_that_grows_with_it(store):
     def peak_and_length():
         tracemalloc.start()
