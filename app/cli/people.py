@@ -30,11 +30,13 @@ def add(
         expires: A link that ends after a time: 30m, 12h, 7d.
     """
     from onedemo.app.http.tokens import issue_link, passing_link, read_secret, read_span
-    from onedemo.core.names import check_person
+    from onedemo.core.names import check_new_name, check_person
 
     name = check_person(name)
     lasts = read_span(expires) if expires is not None else None
     with open_store(data_dir) as store:
+        if name not in {known.name for known in store.accounts.raters()}:
+            check_new_name(name)
         person = store.accounts.ensure(name, "researcher" if researcher else "annotator")
         if once or lasts is not None:
             url = passing_link(store, person, url, once=once, lasts=lasts)
