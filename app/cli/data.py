@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
 from onedemo.core.outputs import check_outputs
-from onedemo.errors import UserError
+from onedemo.errors import UserError, in_words
 
 DATA = Path("data")
 DataDir = Annotated[Path, Parameter(help="Where everything is kept.")]
@@ -32,8 +33,9 @@ def check_output(file: Path, data_dir: Path) -> None:
 
 def export(
     *, data_dir: DataDir = DATA, out: Path | None = None, run: str | None = None, rater: str | None = None,
-    segments: Path | None = None, comparisons: Path | None = None, skips: Path | None = None,
-    card: Path | None = None,
+    segments: Path | None = None, comparisons: Path | None = None, pairs: Path | None = None,
+    skips: Path | None = None, history: Path | None = None, card: Path | None = None,
+    all_: Annotated[Path | None, Parameter(name="--all")] = None,
 ) -> None:  # fmt: skip
     """The ratings as CSV, what was rated as Parquet.
 
@@ -43,51 +45,89 @@ def export(
         rater: Only this rater (of the CSV).
         segments: States and actions behind the clips.
         comparisons: Answers about pairs, as CSV.
+        pairs: States and actions behind the pairs.
         skips: Skipped clips and why, as CSV.
+        history: What was taken back, and who was left out, as CSV.
         card: The data card, in Markdown.
+        all_: Everything, into this new directory, for `onedemo import`.
     """
-    from onedemo.app.dataset.card import card as card_of
-    from onedemo.app.dataset.ratings_csv import csv_blocks, write_parquet
+    from onedemo.app.dataset.exporter import FILES, write_export, write_file
+    from onedemo.app.dataset.ratings_csv import csv_blocks
+    from onedemo.core.directories import make_directory
     from onedemo.core.files import write_atomic
-    from onedemo.storage.comparisons import COMPARISON_COLUMNS
-    from onedemo.storage.ratings import SKIP_COLUMNS
 
-    with open_store(data_dir, must_exist=True) as store:
+    others = {
+        "segments.parquet": segments, "comparisons.csv": comparisons, "pairs.parquet": pairs,
+        "skips.csv": skips, "history.csv": history, "card.md": card,
+    }  # fmt: skip
+    with open_store(data_dir, must_exist=True) as store, written():
         runs = [entry["id"] for entry in store.runs.all()]
         if run is not None and run not in runs:
             raise UserError(f"no run {run!r}; there are: {', '.join(runs) or 'none'}")
-        others = (segments, comparisons, skips, card)
-        for file in (out, *others):
+        for file in (out, *others.values()):
             if file is not None:
                 check_output(file, data_dir)
-        if segments is not None:
-            write_parquet(store, run, segments)
-        if card is not None:
-            write_atomic(card, card_of(store, run).encode())
-        if comparisons is not None:
-            write_atomic(comparisons, csv_blocks(store.comparisons.stream(run), COMPARISON_COLUMNS))
-        if skips is not None:
-            write_atomic(skips, csv_blocks(store.ratings.stream_skips(run), SKIP_COLUMNS))
+        if all_ is not None:
+            if any((all_ / name).exists() for name in FILES):
+                raise UserError(f"{all_} holds an export already; choose another directory")
+            make_directory(all_)
+            write_export(store, run, all_)
+        for name, file in others.items():
+            if file is not None:
+                write_file(store, run, name, file)
         blocks = csv_blocks(store.ratings.stream(run, rater=rater))
         if out is not None:
             write_atomic(out, blocks)
-        elif not any(others):
+        elif all_ is None and not any(others.values()):
             for block in blocks:
                 sys.stdout.buffer.write(block)
             sys.stdout.buffer.flush()
 
 
-def import_(ratings: Path, segments: Path, /, *, data_dir: DataDir = DATA) -> None:
+def import_(
+    source: Path, segments: Path | None = None, /, *, comparisons: Path | None = None,
+    pairs: Path | None = None, skips: Path | None = None, history: Path | None = None,
+    data_dir: DataDir = DATA,
+) -> None:  # fmt: skip
     """An export back into an empty data directory.
 
     Args:
-        ratings: RATINGS.csv of the export.
+        source: The directory of `onedemo export --all`, or RATINGS.csv of an export.
         segments: SEGMENTS.parquet of the export.
+        comparisons: COMPARISONS.csv of the export.
+        pairs: PAIRS.parquet of the export.
+        skips: SKIPS.csv of the export.
+        history: HISTORY.csv of the export.
     """
-    from onedemo.app.dataset.importer import import_data
+    from onedemo.app.dataset.importer import Export, export_in, import_data
 
-    there = import_data(ratings, segments, data_dir)
+    if source.is_dir():
+        given = export_in(source)
+    elif segments is None:
+        raise UserError("give RATINGS.csv and SEGMENTS.parquet, or the directory of onedemo export --all")
+    else:
+        given = Export(
+            ratings=source, segments=segments, comparisons=comparisons, pairs=pairs, skips=skips,
+            history=history,
+        )  # fmt: skip
+    there = import_data(given, data_dir)
     print("  ".join(f"{count} {what}" for what, count in there.items()))
+
+
+@contextmanager
+def written() -> Iterator[None]:
+    """Turns an error of writing (a full disk, say) into a sentence.
+
+    Raises:
+        UserError: In place of OSError.
+    """
+    try:
+        yield
+    except BrokenPipeError:  # whoever reads our output has enough
+        raise
+    except OSError as error:
+        where = f"cannot write {error.filename}" if error.filename else "the result cannot be written"
+        raise UserError(f"{where}: {in_words(error)}") from None
 
 
 def open_store(data_dir: Path, must_exist: bool = False) -> Any:

@@ -30,12 +30,14 @@ def add(
         expires: A link that ends after a time: 30m, 12h, 7d.
     """
     from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, read_span
-    from onedemo.core.names import check_person
+    from onedemo.core.names import check_new_name, check_person
 
     name = check_person(name)
     lasts = read_span(expires) if expires is not None else None
     with open_store(data_dir) as store:
         url = url or read_address(data_dir)
+        if name not in {known.name for known in store.accounts.raters()}:
+            check_new_name(name)
         person = store.accounts.ensure(name, "researcher" if researcher else "annotator")
         if once or lasts is not None:
             url = passing_link(store, person, url, once=once, lasts=lasts)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import html
+import re
 from datetime import UTC, datetime
 from typing import Any
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.annotation.scale import ANSWERS
-from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, as_table
+from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
 
@@ -23,7 +25,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
     runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
     when = f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     parts = [
-        f"# Ratings of robot motion: {run or 'all runs'}\n\n"
+        f"# Ratings of robot motion: {_text(run) if run else 'all runs'}\n\n"
         f"Written by onedemo {program_version()}, {when}.\n",
         "## What it is\n\n"
         "People (or programs) saw two short movements side by side: a moment of one demonstration video, and "
@@ -36,11 +38,19 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         "earlier ratings.\n",
         "## Runs\n\n" + "".join(_run(store, entry) for entry in runs),
         "## Columns of the ratings (CSV)\n\nUTF-8, one header, one row a rating that holds. A text that a "
-        "spreadsheet would take for a formula begins with an apostrophe.\n\n" + as_table(RATINGS),
-        "## Columns of the segments (Parquet)\n\nOne row a rated clip, key `clip_id`. The file's metadata "
-        "`onedemo.training.runs` holds the settings of each run.\n\n" + as_table(SEGMENTS),
+        "spreadsheet would take for a formula begins with an apostrophe. Names may look like numbers: read "
+        "them as text, in pandas with `dtype={'rater': str, 'run': str, 'demo': str}`.\n\n"
+        + as_table(RATINGS),
+        "## Columns of the segments (Parquet)\n\nOne row a clip that somebody rated or skipped, key "
+        "`clip_id`. The file's metadata `onedemo.training.runs` holds the settings of each run.\n\n"
+        + as_table(SEGMENTS),
         "## Columns of the comparisons (CSV)\n\nAnswers to *Which of the two is closer to the video?*\n\n"
         + as_table(COMPARISONS),
+        "## Columns of the pairs (Parquet)\n\nOne row a pair that somebody compared or skipped, key "
+        "`pair_id`.\n\n" + as_table(PAIRS),
+        "## Columns of the skips (CSV)\n\n" + as_table(SKIPS),
+        "## Columns of the history (CSV)\n\nWhat does not hold any more, and who was left out.\n\n"
+        + as_table(HISTORY),
         "## Limits\n\n"
         "- Names of raters are in the data. Replace them before you publish it, and ask the raters.\n"
         "- Ratings are of one robot beside one video, at the speed of the page; they say nothing of others.\n"
@@ -63,8 +73,9 @@ def _run(store: Store, entry: dict[str, Any]) -> str:
         notes = [*figures.warnings, *(["left out of training"] if person.id in left_out else [])]
         lines.append(_line((rater, person.role, *_figures(figures), "; ".join(notes))))
     return (
-        f"### {run}\n\nDemonstration `{entry['demo']}` (SHA-256 `{entry['demo_sha256'][:16]}…`), seed "
-        f"{entry['seed']}, made {entry['created_at']} with onedemo {entry['version']}.\n\n"
+        f"### {_text(run)}\n\nDemonstration {_text(entry['demo'])} (SHA-256 "
+        f"{_text(entry['demo_sha256'][:16])}…), seed {_text(entry['seed'])}, "
+        f"made {_text(entry['created_at'])} with onedemo {_text(entry['version'])}.\n\n"
         + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n"
     )  # fmt: skip
 
@@ -81,4 +92,9 @@ def _figures(figures: Quality) -> list[str]:
 
 
 def _line(cells: Any) -> str:
-    return f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in cells)} |\n"
+    return f"| {' | '.join(_text(cell) for cell in cells)} |\n"
+
+
+def _text(cell: object) -> str:
+    """As text in Markdown: nothing in it makes a column, a tag or a link."""
+    return re.sub(r"([\\|`*_\[\]])", r"\\\1", html.escape(str(cell), quote=False))

@@ -41,7 +41,26 @@ SEGMENTS: dict[str, str] = {
     "qpos": "Positions before each step, metres and radians: (steps, 6).",
     "qvel": "Velocities before each step, metres/s and radians/s: (steps, 6).",
 }
-"""Of the Parquet file, in order; the last four are lists of rows."""
+"""Of the Parquet file of clips, in order; the last four are lists of rows."""
+
+PAIRS: dict[str, str] = {
+    "pair_id": "Pair; key.",
+    "run": "Training that it belongs to.",
+    "demo_step": "Control step of the demonstration at which both clips begin.",
+    "stage": "pretrain or online.",
+    "iteration": "Iteration of the policy whose motion the clips show.",
+    **{
+        f"{side}_{name}": f"{what} of the {side} clip, as `{name}` of the segments."
+        for side in ("left", "right")
+        for name, what in (
+            ("obs", "Observations"),
+            ("actions", "Actions"),
+            ("qpos", "Positions"),
+            ("qvel", "Velocities"),
+        )
+    },
+}
+"""Of the Parquet file of pairs, in order; the last eight are lists of rows."""
 
 
 SKIPS: dict[str, str] = {
@@ -58,6 +77,8 @@ SKIPS: dict[str, str] = {
     "demo_step": "Control step of the demonstration at which the clip begins.",
     "steps": "Length of the clip, control steps.",
     "repeat": "1: it was the same person’s second look; else 0.",
+    "snapshot": "Newest predictor at that time; 0: none.",
+    "predicted": "What that predictor expected, 1 to 5; empty: none.",
 }
 """Of the CSV of skips, in order."""
 
@@ -77,6 +98,27 @@ COMPARISONS: dict[str, str] = {
     "steps": "Length of each clip, control steps.",
 }
 """Of the CSV of comparisons, in order."""
+
+
+HISTORY: dict[str, str] = {
+    "id": "Number of the event, among those of the ratings or, with a pair, of the comparisons.",
+    "clip_id": "Clip that it is about; empty: none.",
+    "pair_id": "Pair that it is about; empty: none.",
+    "run": "Training that it belongs to.",
+    "rater": "Name of the rater that it is of or, without clip and pair, about.",
+    "kind": "rate, skip, undo, leave out, take in; of a pair: left, right, equal, skip, undo.",
+    "value": "Of a rating, 1 to 5.",
+    "repeat": "1: the same person's second opinion; else 0.",
+    "mark_start": "Where the clip goes wrong, seconds from its start; empty: not said.",
+    "mark_end": "End of that stretch, seconds from the start of the clip.",
+    "reason": "Of a skip, in the rater’s words.",
+    "snapshot": "Newest predictor at that time; 0: none.",
+    "predicted": "What that predictor expected, 1 to 5; empty: none.",
+    "latency_ms": "From the clip or pair on screen to the press, milliseconds.",
+    "created_at": "When it was: UTC, ISO 8601, milliseconds.",
+    "by": "Who left a rater out or took one in.",
+}
+"""Of the CSV of what does not hold any more, in order."""
 
 
 def as_table(columns: dict[str, str]) -> str:

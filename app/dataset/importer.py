@@ -1,111 +1,264 @@
-"""An export back into a data directory: the same ratings in the same order, so the same predictor."""
+"""An export back into a data directory: the same events in the same order, so the same predictor.
+
+The files may be anybody's, or edited: each number, name and time is checked where it is read, and what
+one file says of another is checked here.
+"""
 
 from __future__ import annotations
 
-import csv
+import re
 import sqlite3
+import tomllib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from onedemo.app.dataset.columns import RATINGS
-from onedemo.app.dataset.parquet import read_about, read_segments
+from onedemo.app.dataset import csv_reader as cell
+from onedemo.app.dataset.exporter import FILES
+from onedemo.app.dataset.parquet import read_about, read_pairs, read_segments
 from onedemo.core.files import write_atomic
-from onedemo.core.names import LONGEST
+from onedemo.core.names import check_name
 from onedemo.errors import UserError
+from onedemo.sim.vector_env import spec
+from onedemo.storage.comparisons import ANSWERS
 from onedemo.storage.run_directory import RunDirectory, check_run_name
 from onedemo.storage.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
+_LONGEST_CONFIG = 1 << 20
+
+_PREDICTION = cell.number(-100.0, 100.0)
+_EVENT = {
+    "id": cell.whole(1), "run": cell.name, "rater": cell.name, "created_at": cell.time,
+    "latency_ms": cell.whole(0),
+}  # fmt: skip
+_PREDICTED = {"snapshot": cell.whole(0), "predicted?": _PREDICTION}
+_MARK = {"mark_start?": cell.number(0.0, 1e6), "mark_end?": cell.number(0.0, 1e6)}
+_RATINGS = {
+    **_EVENT, "clip_id": cell.whole(1), "value": cell.whole(1, 5), "repeat": cell.whole(0, 1),
+    "left_out": cell.whole(0, 1), **_PREDICTED, **_MARK,
+}  # fmt: skip
+_SKIPS = {
+    **_EVENT, "clip_id": cell.whole(1), "reason?": cell.line, "repeat": cell.whole(0, 1),
+    "snapshot?": cell.whole(0), "predicted?": _PREDICTION,
+}  # fmt: skip
+_COMPARISONS = {**_EVENT, "pair_id": cell.whole(1), "answer": cell.one_of(*ANSWERS)}
+_HISTORY = {
+    **_EVENT, "clip_id?": cell.whole(1), "pair_id?": cell.whole(1), "value?": cell.whole(1, 5),
+    "kind": cell.one_of("rate", "skip", "undo", "leave out", "take in", *ANSWERS),
+    "repeat": cell.whole(0, 1), **_MARK, "reason?": cell.line, "snapshot?": cell.whole(0),
+    "predicted?": _PREDICTION, "by?": cell.name,
+}  # fmt: skip
 
 
-def import_data(ratings: Path, segments: Path, data_dir: Path) -> dict[str, int]:
-    """Fills an empty data directory with exported runs, clips and ratings. All of it, or nothing.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Export:
+    """The files of an export; those that are None have nothing in them."""
+
+    ratings: Path | None
+    segments: Path
+    skips: Path | None = None
+    comparisons: Path | None = None
+    pairs: Path | None = None
+    history: Path | None = None
+
+
+def export_in(directory: Path) -> Export:
+    """The export that ``onedemo export --all`` wrote into a directory.
+
+    Raises:
+        UserError: If there is none.
+    """
+    there = {name.partition(".")[0]: directory / name for name in FILES if (directory / name).is_file()}
+    if "segments" not in there:
+        raise UserError(f"no segments.parquet in {directory}; is it what onedemo export --all wrote?")
+    there.pop("card", None)
+    return Export(**{"ratings": None, **there})
+
+
+def import_data(export: Export, data_dir: Path) -> dict[str, int]:
+    """Fills an empty data directory with exported runs, clips, pairs and events. All of it, or nothing.
 
     Args:
-        ratings: The CSV.
-        segments: The Parquet file.
-        data_dir: Where to; must hold no ratings yet.
+        export: The files.
+        data_dir: Where to; must hold no runs yet.
 
     Returns:
-        How many "runs", "clips" and "ratings" there are now.
+        How many "runs", "clips", "ratings", "comparisons" and "events" of both there are now.
 
     Raises:
         UserError: If a file is not an export, they do not belong together, or the directory holds data.
     """
-    runs, roles = read_about(segments)
-    rows = list(_rows(ratings))
+    runs, roles = read_about(export.segments)
+    for run in runs:
+        _check_run(run, export.segments)
+    if len({run["id"] for run in runs}) != len(runs):
+        raise UserError(f"{export.segments} describes a run twice")
+    widths = {run["id"]: _widths(run, export.segments) for run in runs}
     store = Store(data_dir)
     try:
         if store.runs.all():
             raise UserError(f"{data_dir} holds runs already; import into an empty data directory")
         with store.database.transaction():
             for run in runs:
-                _check_run(run, segments)
-                store.runs.add(run=run["id"], **{name: run[name] for name in _RUN[1:]})
-            clips = store.clips.restore(read_segments(segments))
-            raters: dict[str, int] = {}
-            for number, row in enumerate(rows, start=2):
-                if row["clip_id"] not in clips:
-                    raise UserError(f"{ratings}, line {number}: clip {row['clip_id']} is not in {segments}")
-                if row["rater"] not in raters:
-                    role = roles.get(row["rater"], "annotator")
-                    if not 1 <= len(row["rater"]) <= LONGEST or not row["rater"].isprintable():
-                        raise UserError(f"{ratings}, line {number}: {row['rater'][:80]!a} is no rater's name")
-                    raters[row["rater"]] = store.accounts.ensure(row["rater"], role).id
-                try:
-                    store.ratings.restore(row, raters[row["rater"]])
-                except sqlite3.IntegrityError as error:
-                    raise UserError(f"{ratings}, line {number}: {error}") from None
-            for run, rater in sorted({(row["run"], row["rater"]) for row in rows if row["left_out"]}):
-                store.ratings.leave_out(run, raters[rater], by=raters[rater])
+                store.runs.add(
+                    run=run["id"], **{name: run[name] for name in _RUN[1:]},
+                    created_at=run.get("created_at"), step_seconds=run.get("step_seconds", 0.008),
+                )  # fmt: skip
+            try:
+                clips = store.clips.restore(read_segments(export.segments, widths))
+                pairs = {}
+                if export.pairs is not None:
+                    pairs = store.comparisons.restore_pairs(read_pairs(export.pairs, widths))
+            except sqlite3.IntegrityError:
+                raise UserError("two clips or pairs of the export have one number") from None
+            counts = _Events(store, export, clips, pairs, roles).restore()
         for run in runs:
             write_atomic(RunDirectory(data_dir, run["id"]).config, run["config"].encode())
     finally:
         store.close()
-    return {"runs": len(runs), "clips": len(clips), "ratings": len(rows)}
+    return {"runs": len(runs), "clips": len(clips), **counts}
 
 
-_NUMBERS: dict[str, type] = {
-    "id": int, "clip_id": int, "value": int, "latency_ms": int, "snapshot": int, "repeat": int,
-    "left_out": int, "predicted": float, "mark_start": float, "mark_end": float,
-}  # fmt: skip
+class _Events:
+    """What people said, from four files, in the order of its numbers."""
 
+    def __init__(
+        self, store: Store, export: Export, clips: dict[int, str], pairs: dict[int, str],
+        roles: dict[str, str],
+    ) -> None:  # fmt: skip
+        self._store, self._export, self._roles = store, export, roles
+        self._clips, self._pairs = clips, pairs
+        self._raters: dict[str, int] = {}
+        self._seen: dict[tuple[str, int], str] = {}
 
-def _rows(file: Path) -> Iterator[dict[str, Any]]:
-    try:
-        with file.open(newline="", encoding="utf-8") as source:
-            reader = csv.DictReader(source)
-            missing = set(RATINGS) - set(reader.fieldnames or ())
-            if missing:
-                raise UserError(
-                    f"{file} has no column {', '.join(sorted(missing))}; is it an export of ratings?"
-                )
-            for number, row in enumerate(reader, start=2):
-                try:
-                    values: dict[str, Any] = {
-                        name: kind(row[name]) if row[name] != "" else None for name, kind in _NUMBERS.items()
-                    }
-                    if values["value"] not in range(1, 6):
-                        raise ValueError(f"value must be 1 to 5, got {row['value']!r}")
-                except (TypeError, ValueError) as error:
-                    raise UserError(f"{file}, line {number}: {error}") from None
-                text = {name: _armed(row[name]) for name in ("run", "rater", "created_at")}
-                yield values | text
-    except FileNotFoundError:
-        raise UserError(f"there is no file {file}") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{file} cannot be read as CSV: {error}") from None
+    def restore(self) -> dict[str, int]:
+        events, answers, left_out = [], [], set()
+        for where, row in self._rows():
+            row |= {"rater_id": self._rater(row["rater"], where), "where": where}
+            of_pair = row.get("pair_id") is not None
+            self._check(row, of_pair, where)
+            if row.get("left_out"):
+                left_out.add((row["run"], row["rater_id"]))
+            (answers if of_pair else events).append(row)
+        last: dict[tuple, str] = {}
+        for row in sorted(events, key=lambda row: row["id"]):
+            about_rater = row["clip_id"] is None
+            key = (row["clip_id"], row["rater_id"], row["repeat"])
+            if row["kind"] == "skip" and row["reason"] and last.get(key) == "skip":
+                row["latency_ms"] = 0  # an export gives it the time of the skip that it explains
+            last[key] = row["kind"]
+            self._put(self._store.ratings.restore, row | {"run": row["run"] if about_rater else None})
+        for row in sorted(answers, key=lambda row: row["id"]):
+            self._put(self._store.comparisons.restore, row)
+        if self._export.history is None:
+            for run, rater in sorted(left_out):
+                self._store.ratings.leave_out(run, rater, by=rater)
+        return {
+            "ratings": sum("left_out" in row for row in events),
+            "comparisons": sum("kind" not in row for row in answers),
+            "events": len(events) + len(answers),
+        }
 
+    def _rows(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """(file and line, row of a table) of every event."""
+        export = self._export
+        nothing = {"value": None, "reason": None, "mark_start": None, "mark_end": None}
+        if export.ratings is not None:
+            for line, row in cell.read_table(export.ratings, "ratings", _RATINGS):
+                yield f"{export.ratings}, line {line}", nothing | row | {"kind": "rate"}
+        if export.skips is not None:
+            table = cell.read_table(export.skips, "skips", _SKIPS, may_lack=("snapshot", "predicted"))
+            for line, row in table:
+                row["snapshot"] = row["snapshot"] or 0
+                yield f"{export.skips}, line {line}", nothing | row | {"kind": "skip"}
+        if export.comparisons is not None:
+            for line, row in cell.read_table(export.comparisons, "comparisons", _COMPARISONS):
+                yield f"{export.comparisons}, line {line}", row
+        if export.history is not None:
+            for line, row in cell.read_table(export.history, "the history", _HISTORY):
+                where = f"{export.history}, line {line}"
+                by = row.pop("by")
+                row |= {
+                    "answer": row["kind"], "snapshot": row["snapshot"] or 0,
+                    "by_id": self._rater(by, where) if by is not None else None,
+                }  # fmt: skip
+                yield where, row
 
-def _armed(cell: str) -> str:
-    """A cell before it was made harmless to spreadsheets (``onedemo.app.dataset.ratings_csv.defuse``)."""
-    return cell[1:] if cell.startswith("'") and cell[1:2] in ("=", "+", "-", "@", "\t", "\r") else cell
+    def _rater(self, name: str, where: str) -> int:
+        if name not in self._raters:
+            role = self._roles.get(name, "annotator")
+            try:
+                self._raters[name] = self._store.accounts.ensure(name, role).id
+            except UserError as error:
+                raise UserError(f"{where}: {error}") from None
+        return self._raters[name]
+
+    def _check(self, row: dict[str, Any], of_pair: bool, where: str) -> None:
+        kind = "comparison" if of_pair else "rating"
+        before = self._seen.setdefault((kind, row["id"]), where)
+        if before != where:
+            raise UserError(f"{where}: {kind} {row['id']} is there twice, first in {before}")
+        known, what = (self._pairs, "pair") if of_pair else (self._clips, "clip")
+        number = row["pair_id" if of_pair else "clip_id"]
+        if number is None:
+            runs = {entry["id"] for entry in self._store.runs.all()}
+            if row["kind"] not in ("leave out", "take in") or row["run"] not in runs:
+                raise UserError(f"{where}: it is about no clip, no pair and no rater of a run")
+            return
+        if number not in known:
+            file = self._export.pairs if of_pair else self._export.segments
+            raise UserError(f"{where}: {what} {number} is not in {file or 'any file that was given'}")
+        if known[number] != row["run"]:
+            given = ascii(row["run"][:80])
+            raise UserError(f"{where}: {what} {number} belongs to run {known[number]!r}, not {given}")
+        allowed = (*ANSWERS, "skip", "undo") if of_pair else ("rate", "skip", "undo")
+        if row.get("kind", "left") not in allowed:
+            raise UserError(f"{where}: a {what} is not for {row['kind']!r}")
+        start, end = row.get("mark_start"), row.get("mark_end")
+        if (start is None) != (end is None) or (start is not None and not start < end):
+            raise UserError(f"{where}: a mark begins at mark_start and ends later, at mark_end")
+
+    def _put(self, restore: Any, row: dict[str, Any]) -> None:
+        try:
+            restore(row)
+        except sqlite3.IntegrityError as error:
+            raise UserError(f"{row['where']}: this cannot be kept ({error})") from None
 
 
 def _check_run(run: Any, file: Path) -> None:
-    if not isinstance(run, dict) or not all(
-        isinstance(run.get(n), int if n == "seed" else str) for n in _RUN
-    ):
-        raise UserError(f"{file} does not say what its runs are")
-    check_run_name(run["id"])
+    """Raises UserError unless that can be a run of ours: its name becomes a directory, the rest is shown."""
+    try:
+        if not isinstance(run, dict):
+            raise ValueError("it is no table")
+        for name in _RUN:
+            if not isinstance(run.get(name), int if name == "seed" else str):
+                raise ValueError(f"{name} is missing")
+        check_run_name(run["id"])
+        check_name(run["demo"])
+        if not re.fullmatch(r"[0-9a-f]{64}", run["demo_sha256"], re.ASCII):
+            raise ValueError("demo_sha256 is none")
+        if not 0 <= run["seed"] < 2**63 or isinstance(run["seed"], bool):
+            raise ValueError("seed is out of range")
+        if not re.fullmatch(r"[\w.+!-]{1,40}", run["version"], re.ASCII):
+            raise ValueError("version is none")
+        if run.get("created_at") is not None:
+            cell.time(run["created_at"])
+        if not 1e-6 < float(run.get("step_seconds", 0.008)) < 10:
+            raise ValueError("step_seconds is out of range")
+        if len(run["config"]) > _LONGEST_CONFIG:
+            raise ValueError("config is too long")
+        tomllib.loads(run["config"])
+    except (UserError, ValueError, TypeError, RecursionError) as error:
+        raise UserError(f"{file} does not say what its runs are: {error}") from None
+
+
+def _widths(run: dict[str, Any], file: Path) -> dict[str, int]:
+    """Columns of each array of a run's robot."""
+    try:
+        robot = spec(str(tomllib.loads(run["config"]).get("env", "hopper")))
+    except UserError as error:
+        raise UserError(f"{file}: run {run['id']}: {error}") from None
+    places = (robot.obs_size + 1) // 2
+    return {"obs": robot.obs_size, "actions": robot.action_size, "qpos": places, "qvel": places}

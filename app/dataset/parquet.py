@@ -1,29 +1,51 @@
-"""Segments as Parquet: what was rated, keyed by clip. The runs they belong to are in the file's metadata."""
+"""Segments as Parquet: the motion behind clips and pairs. What runs they belong to is in the file's metadata.
+
+Shapes: W control steps, o observations, a actions, q positions, v velocities.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from onedemo.app.dataset.columns import SEGMENTS
+from onedemo.app.dataset.columns import PAIRS, SEGMENTS
 from onedemo.errors import UserError
+from onedemo.storage.comparisons import NewPair
 from onedemo.types import ROLES, Clip, Segment
 
 _ARRAYS = ("obs", "actions", "qpos", "qvel")
 _RUNS, _ROLES = b"onedemo.training.runs", b"onedemo.annotators.oracle"
 _GROUP = 500
 """Clips that are in memory at a time."""
+_MOST_NUMBERS, _MOST_TIMES = 1 << 23, 2
+"""Of a file; or so many times its bytes. Motion has one for some eight bytes: it can hardly be packed."""
+_MOST_STEPS = 10_000
+"""Of a segment; one has some 40."""
+_MOST, _MOST_DEMO = 10**9, 10**7
+_CHOICE = re.compile(r"([A-Za-z][A-Za-z _-]{0,39})?", re.ASCII)
+_Row = TypeVar("_Row")
 
-_MATRIX = {
-    np.dtype(np.float64): pa.list_(pa.list_(pa.float64())),
-    np.dtype(np.float32): pa.list_(pa.list_(pa.float32())),
-}
+# Actions are float32, all else float64, as the trainer makes them; older data may differ in width, and is
+# written wider.
+_MATRIX = {name: pa.list_(pa.list_(pa.float32() if name == "actions" else pa.float64())) for name in _ARRAYS}
+_CLIP_TYPES = {
+    "clip_id": pa.int64(), "run": pa.string(), "demo_step": pa.int64(), "stage": pa.string(),
+    "iteration": pa.int64(), "snapshot": pa.int64(), "predicted": pa.float64(), "choice": pa.string(),
+    "score": pa.float64(), **_MATRIX,
+}  # fmt: skip
+_PAIR_TYPES = {
+    "pair_id": pa.int64(), "run": pa.string(), "demo_step": pa.int64(), "stage": pa.string(),
+    "iteration": pa.int64(),
+    **{f"{side}_{name}": kind for side in ("left", "right") for name, kind in _MATRIX.items()},
+}  # fmt: skip
+assert (list(_CLIP_TYPES), list(_PAIR_TYPES)) == (list(SEGMENTS), list(PAIRS))
 
 
 def write_segments(
@@ -40,33 +62,27 @@ def write_segments(
     Returns:
         How many there were.
     """
-    written, block = 0, []
-    # Actions are float32, all else float64, as the trainer makes them; older data may differ in width,
-    # and is written wider.
-    types = {
-        "clip_id": pa.int64(), "run": pa.string(), "demo_step": pa.int64(), "stage": pa.string(),
-        "iteration": pa.int64(), "snapshot": pa.int64(), "predicted": pa.float64(), "choice": pa.string(),
-        "score": pa.float64(), "obs": _MATRIX[np.dtype(np.float64)],
-        "actions": _MATRIX[np.dtype(np.float32)], "qpos": _MATRIX[np.dtype(np.float64)],
-        "qvel": _MATRIX[np.dtype(np.float64)],
-    }  # fmt: skip
-    assert list(types) == list(SEGMENTS)
     about = {_RUNS: json.dumps(runs).encode(), _ROLES: json.dumps(roles).encode()}
-    schema = pa.schema(list(types.items()), about)
-    with pq.ParquetWriter(file, schema, compression="zstd") as writer:
-        for clip, segment in clips:
-            block.append(_row(clip, segment))
-            if len(block) == _GROUP:
-                writer.write_table(pa.Table.from_pylist(block, schema))
-                block = []
-            written += 1
-        if block or not written:
-            writer.write_table(pa.Table.from_pylist(block, schema))
-    return written
+    names = [name for name in SEGMENTS if name not in (*_ARRAYS, "clip_id")]
+    rows = (
+        {"clip_id": clip.id, **{name: getattr(clip, name) for name in names}, **_lists(segment)}
+        for clip, segment in clips
+    )
+    return _write(file, pa.schema(list(_CLIP_TYPES.items()), about), rows)
 
 
-def read_about(file: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """The runs that a file's clips belong to, and the roles of the raters.
+def write_pairs(file: Path, pairs: Iterable[tuple[int, str, NewPair]]) -> int:
+    """Writes pairs with both segments of each, as ``write_segments``; returns how many there were."""
+    rows = (
+        {"pair_id": number, "run": run, "demo_step": pair.demo_step, "stage": pair.stage,
+         "iteration": pair.iteration, **_lists(pair.left, "left_"), **_lists(pair.right, "right_")}
+        for number, run, pair in pairs
+    )  # fmt: skip
+    return _write(file, pa.schema(list(_PAIR_TYPES.items())), rows)
+
+
+def read_about(file: Path) -> tuple[list[Any], dict[str, str]]:
+    """The runs that a file's clips belong to, not checked yet, and the roles of the raters.
 
     Raises:
         UserError: If it is no such file.
@@ -79,38 +95,134 @@ def read_about(file: Path) -> tuple[list[dict[str, Any]], dict[str, str]]:
         return runs, roles
     except FileNotFoundError:
         raise UserError(f"there is no file {file}") from None
-    except (OSError, pa.ArrowException, KeyError, ValueError, AttributeError):
+    except (OSError, pa.ArrowException, KeyError, ValueError, TypeError, AttributeError, RecursionError):
         raise UserError(
             f"{file} is not a file of segments that onedemo wrote; make one with onedemo export --segments"
         ) from None
 
 
-def read_segments(file: Path) -> Iterator[tuple[Clip, Segment]]:
+def read_segments(file: Path, widths: dict[str, dict[str, int]]) -> Iterator[tuple[Clip, Segment]]:
     """The clips of a file with their segments, as they were written.
 
+    Args:
+        file: What ``write_segments`` wrote, perhaps.
+        widths: Of each run: of each of its arrays.
+
     Raises:
-        UserError: If a row is no clip.
+        UserError: If it is damaged, or a row is no clip of one of these runs.
     """
-    with pq.ParquetFile(file) as source:
-        if source.schema_arrow.names != list(SEGMENTS):
-            raise UserError(f"{file} has columns {source.schema_arrow.names}, not {list(SEGMENTS)}")
-        for block in source.iter_batches(batch_size=_GROUP):
-            for row in block.to_pylist():
-                try:
-                    arrays = {
-                        name: np.array(row[name], np.float32 if name == "actions" else np.float64)
-                        for name in _ARRAYS
-                    }
-                    clip = Clip(
-                        id=row["clip_id"], run=row["run"], demo_step=row["demo_step"], stage=row["stage"],
-                        iteration=row["iteration"], snapshot=row["snapshot"], predicted=row["predicted"],
-                        steps=len(arrays["obs"]), choice=row["choice"], score=row["score"],
-                    )  # fmt: skip
-                    yield clip, Segment(**arrays)
-                except (TypeError, ValueError) as error:
-                    raise UserError(f"{file}: clip {row['clip_id']} cannot be read: {error}") from None
+
+    def clip(row: dict[str, Any]) -> tuple[Clip, Segment]:
+        segment = _segment(row, widths[_run(row, widths)])
+        if not _CHOICE.fullmatch(choice := row["choice"]):
+            raise ValueError(f"choice is {choice[:80]!a}, not a word")
+        return Clip(
+            id=_whole(row, "clip_id", 1), run=row["run"], stage=_stage(row),
+            demo_step=_whole(row, "demo_step", most=_MOST_DEMO), iteration=_whole(row, "iteration"),
+            snapshot=_whole(row, "snapshot"), predicted=_finite(row, "predicted"), steps=len(segment),
+            choice=choice, score=_finite(row, "score"),
+        ), segment  # fmt: skip
+
+    return _read(file, _CLIP_TYPES, clip)
 
 
-def _row(clip: Clip, segment: Segment) -> dict[str, Any]:
-    row = {name: getattr(clip, name) for name in SEGMENTS if name not in (*_ARRAYS, "clip_id")}
-    return {"clip_id": clip.id, **row} | {name: getattr(segment, name).tolist() for name in _ARRAYS}
+def read_pairs(file: Path, widths: dict[str, dict[str, int]]) -> Iterator[tuple[int, str, NewPair]]:
+    """The pairs of a file, as ``read_segments``."""
+
+    def pair(row: dict[str, Any]) -> tuple[int, str, NewPair]:
+        run = _run(row, widths)
+        left, right = (_segment(row, widths[run], side) for side in ("left_", "right_"))
+        if len(left) != len(right):
+            raise ValueError("its two clips are not of one length")
+        new = NewPair(
+            demo_step=_whole(row, "demo_step", most=_MOST_DEMO), stage=_stage(row),
+            iteration=_whole(row, "iteration"), left=left, right=right,
+        )  # fmt: skip
+        return _whole(row, "pair_id", 1), run, new
+
+    return _read(file, _PAIR_TYPES, pair)
+
+
+def _write(file: Path, schema: pa.Schema, rows: Iterable[dict[str, Any]]) -> int:
+    written, block = 0, []
+    with pq.ParquetWriter(file, schema, compression="zstd") as writer:
+        for row in rows:
+            block.append(row)
+            if len(block) == _GROUP:
+                writer.write_table(pa.Table.from_pylist(block, schema))
+                block = []
+            written += 1
+        if block or not written:
+            writer.write_table(pa.Table.from_pylist(block, schema))
+    return written
+
+
+def _read(
+    file: Path, types: dict[str, pa.DataType], read: Callable[[dict[str, Any]], _Row]
+) -> Iterator[_Row]:
+    try:
+        with pq.ParquetFile(file) as source:
+            there = source.schema_arrow
+            if there.names != list(types):
+                raise UserError(f"{file} has columns {there.names}, not {list(types)}")
+            for name, kind in types.items():
+                if there.field(name).type != kind:
+                    raise UserError(f"{file}: its column {name} is {there.field(name).type}, not {kind}")
+            about = source.metadata
+            groups = [about.row_group(k) for k in range(about.num_row_groups)]
+            numbers = sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
+            if numbers > max(_MOST_NUMBERS, _MOST_TIMES * file.stat().st_size):
+                raise UserError(f"{file} would unpack to {numbers:,} numbers: no export of onedemo does")
+            for block in source.iter_batches(batch_size=_GROUP):
+                for row in block.to_pylist():
+                    try:
+                        yield read(row)
+                    except (TypeError, ValueError, KeyError) as error:
+                        key = next(iter(types))
+                        kind = key.removesuffix("_id")
+                        raise UserError(f"{file}: {kind} {row[key]} cannot be read: {error}") from None
+    except FileNotFoundError:
+        raise UserError(f"there is no file {file}") from None
+    except (OSError, pa.ArrowException) as error:
+        said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise UserError(f"{file} is damaged: {said}") from None
+
+
+def _lists(segment: Segment, side: str = "") -> dict[str, list]:
+    return {side + name: getattr(segment, name).tolist() for name in _ARRAYS}
+
+
+def _segment(row: dict[str, Any], widths: dict[str, int], side: str = "") -> Segment:
+    arrays = {}
+    for name in _ARRAYS:
+        array = np.array(row[side + name], np.float32 if name == "actions" else np.float64)
+        if array.ndim != 2 or array.shape[1] != widths[name] or not 1 <= len(array) <= _MOST_STEPS:
+            raise ValueError(f"{side}{name} is {array.shape}, not (steps, {widths[name]})")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{side}{name} has numbers that are not finite")
+        arrays[name] = array
+    return Segment(**arrays)
+
+
+def _run(row: dict[str, Any], widths: dict[str, dict[str, int]]) -> str:
+    if row["run"] not in widths:
+        raise ValueError(f"it is of run {str(row['run'])[:80]!a}, which the file does not describe")
+    return row["run"]
+
+
+def _stage(row: dict[str, Any]) -> str:
+    if row["stage"] not in ("pretrain", "online"):
+        raise ValueError(f"stage is {str(row['stage'])[:80]!a}, not pretrain or online")
+    return row["stage"]
+
+
+def _whole(row: dict[str, Any], name: str, least: int = 0, most: int = _MOST) -> int:
+    if not isinstance(row[name], int) or not least <= row[name] <= most:
+        raise ValueError(f"{name} is {row[name]}, not a whole number from {least} to {most:,}")
+    return row[name]
+
+
+def _finite(row: dict[str, Any], name: str) -> float | None:
+    if row[name] is not None and not np.isfinite(row[name]):
+        raise ValueError(f"{name} is {row[name]}")
+    return row[name]

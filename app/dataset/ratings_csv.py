@@ -1,20 +1,17 @@
-"""Ratings as CSV, in pieces, safe to open in a spreadsheet; and the segments behind them."""
+"""Ratings as CSV, in pieces, safe to open in a spreadsheet."""
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Generator, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
-from pathlib import Path
 
-from onedemo.app.dataset.parquet import write_segments
-from onedemo.core.files import replacing
 from onedemo.storage.ratings import RATING_COLUMNS
-from onedemo.storage.store import Store
 
-_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
 
 def defuse(value: object) -> object:
@@ -22,7 +19,12 @@ def defuse(value: object) -> object:
 
     Numbers stay as they are.
     """
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
+
+
+def armed(cell: str) -> str:
+    """The reverse of ``defuse``."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def csv_blocks(
@@ -56,14 +58,3 @@ def _drain(buffer: io.StringIO) -> bytes:
     buffer.seek(0)
     buffer.truncate()
     return data
-
-
-def write_parquet(store: Store, run: str | None, file: Path) -> int:
-    """Writes the segments of all rated clips, of one run or of all; returns how many.
-
-    A file that is there already is replaced once the new one is whole.
-    """
-    runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
-    roles = {rater.name: rater.role for rater in store.accounts.raters()}
-    with replacing(file) as half:
-        return write_segments(half, store.clips.rated(run), runs, roles)

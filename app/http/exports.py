@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import re
 import tempfile
-from collections.abc import Generator
+import zipfile
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -16,9 +18,9 @@ from aiohttp import web
 from onedemo.app.dataset import ratings_csv
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import RATINGS
+from onedemo.app.dataset.exporter import FILES, csv_of, write_export, write_file
 from onedemo.app.templates import render
-from onedemo.storage.comparisons import COMPARISON_COLUMNS
-from onedemo.storage.ratings import SKIP_COLUMNS
+from onedemo.errors import in_words
 from onedemo.storage.store import Store
 
 FILTERS = ("run", "rater", "stage", "value", "choice", "repeat", "left_out")
@@ -47,13 +49,14 @@ class Downloads:
 
     async def comparisons(self, request: web.Request) -> web.StreamResponse:
         """The answers about pairs."""
-        rows = self._store.comparisons.stream(read_filters(request.query).get("run"))
-        return await self._stream(request, "comparisons", ratings_csv.csv_blocks(rows, COMPARISON_COLUMNS))
+        return await self._stream(request, "comparisons", self._blocks(request, "comparisons.csv"))
 
     async def skips(self, request: web.Request) -> web.StreamResponse:
         """Skipped clips, and why."""
-        rows = self._store.ratings.stream_skips(read_filters(request.query).get("run"))
-        return await self._stream(request, "skips", ratings_csv.csv_blocks(rows, SKIP_COLUMNS))
+        return await self._stream(request, "skips", self._blocks(request, "skips.csv"))
+
+    def _blocks(self, request: web.Request, name: str) -> Generator[bytes, None, None]:
+        return csv_of(self._store, read_filters(request.query).get("run"), name)
 
     async def _stream(
         self, request: web.Request, what: str, blocks: Generator[bytes, None, None]
@@ -73,11 +76,33 @@ class Downloads:
 
     async def parquet(self, request: web.Request) -> web.StreamResponse:
         """The segments behind the clips."""
+        write = partial(write_file, self._store, read_filters(request.query).get("run"), "segments.parquet")
+        return await self._file(request, "segments", "parquet", "application/vnd.apache.parquet", write)
+
+    async def everything(self, request: web.Request) -> web.StreamResponse:
+        """All that people gave, for ``onedemo import``."""
         run = read_filters(request.query).get("run")
+
+        def write(file: Path) -> None:
+            write_export(self._store, run, file.parent)
+            with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name in FILES:
+                    archive.write(file.parent / name, f"{file.stem}/{name}")
+
+        return await self._file(request, "everything", "zip", "application/zip", write)
+
+    async def _file(
+        self, request: web.Request, what: str, suffix: str, kind: str, write: Callable[[Path], None]
+    ) -> web.StreamResponse:
+        response = self._attachment(what, suffix, kind)
         with tempfile.TemporaryDirectory() as directory:
-            file = Path(directory) / "segments.parquet"
-            await asyncio.to_thread(ratings_csv.write_parquet, self._store, run, file)
-            response = self._attachment("segments", "parquet", "application/vnd.apache.parquet")
+            file = Path(directory) / ratings_csv.file_name(what, suffix)
+            try:
+                await asyncio.to_thread(write, file)
+            except OSError as error:
+                raise web.HTTPInsufficientStorage(
+                    text=f"The file could not be made. {in_words(error)}"
+                ) from None
             await response.prepare(request)
             with file.open("rb") as source:
                 while block := await asyncio.to_thread(source.read, 1 << 18):

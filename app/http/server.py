@@ -155,6 +155,7 @@ class Front:
             Route("GET", "/comparisons.csv", "researcher", downloads.comparisons, "downloaded comparisons"),
             Route("GET", "/skips.csv", "researcher", downloads.skips, "downloaded skips"),
             Route("GET", "/segments.parquet", "researcher", downloads.parquet, "downloaded segments"),
+            Route("GET", "/export.zip", "researcher", downloads.everything, "downloaded everything"),
             Route("GET", "/card.md", "researcher", downloads.card, "downloaded the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
             Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),

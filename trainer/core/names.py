@@ -9,14 +9,34 @@ from onedemo.errors import UserError
 
 LONGEST = 64
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
+_MISSING = frozenset(("NA", "N-A", "NULL", "null", "None", "NaN", "nan", "-nan", "-NaN"))
 _IN_PEOPLE = frozenset(" -_.'@,()+&#")
 """Characters in a person's name besides letters and digits."""
 
 
-def check_name(name: str, *, longest: int = LONGEST) -> None:
-    """Raises UserError unless the name is safe as a file name and in a link, and no longer than that."""
-    if not (_NAME.fullmatch(name) and len(name) <= longest):
-        raise UserError(f"a name is 1 to {longest} letters, digits, '-' or '_', got {_shown(name)}")
+def check_name(name: str, *, longest: int = LONGEST) -> str:
+    """The name, which may become one part of a path and of a link, wherever it came from.
+
+    Every name that was not chosen by the program goes through here where it becomes a path.
+
+    Raises:
+        UserError: Unless it is 1 to so many letters, digits, '-' or '_'.
+    """
+    if not (isinstance(name, str) and _NAME.fullmatch(name) and len(name) <= longest):
+        raise UserError(f"a name is 1 to {longest} letters, digits, '-' or '_', got {_shown(str(name))}")
+    return name
+
+
+def check_new_name(name: str) -> None:
+    """Raises UserError if that is what programs write for "no value": nobody and nothing new is called so.
+
+    pandas and R would read it as missing in every export. What is called so already stays.
+    """
+    if name in _MISSING:
+        raise UserError(
+            f"{name!r} means a missing value to programs that read exports; choose another name, such as "
+            f"{name}1"
+        )
 
 
 def check_person(name: str) -> str:

@@ -64,9 +64,13 @@ class Clips:
                 )
             return added
 
-    def restore(self, clips: Iterable[tuple[Clip, Segment]]) -> set[int]:
-        """Stores clips of an export under the numbers they had, which it returns; nobody is asked them."""
-        numbers = set()
+    def restore(self, clips: Iterable[tuple[Clip, Segment]]) -> dict[int, str]:
+        """Stores clips of an export under the numbers they had; nobody is asked them.
+
+        Returns:
+            The run of each, by its number.
+        """
+        numbers = {}
         with self._database.transaction() as db:
             for clip, segment in clips:
                 db.execute(
@@ -75,15 +79,15 @@ class Clips:
                     (*(getattr(clip, name) for name in _CLIP.split(", ")), now()),
                 )
                 db.execute("INSERT INTO segments VALUES (?, ?)", (clip.id, pack_segment(segment)))
-                numbers.add(clip.id)
+                numbers[clip.id] = clip.run
         return numbers
 
-    def rated(self, run: str | None = None) -> Iterator[tuple[Clip, Segment]]:
-        """Every clip that has a rating, with its segment, in order, streamed."""
+    def answered(self, run: str | None = None) -> Iterator[tuple[Clip, Segment]]:
+        """Every clip that anybody ever rated or skipped, with its segment, in order, streamed."""
         columns = ", ".join(f"c.{name}" for name in _CLIP.split(", "))
         rows = self._database.stream(
             f"SELECT {columns}, s.data FROM clips c JOIN segments s ON s.clip_id = c.id"
-            " WHERE (?1 IS NULL OR c.run = ?1) AND c.id IN (SELECT clip_id FROM ratings) ORDER BY c.id",
+            " WHERE (?1 IS NULL OR c.run = ?1) AND c.id IN (SELECT clip_id FROM events) ORDER BY c.id",
             (run,),
         )
         for *values, data in rows:

@@ -6,8 +6,9 @@ events, like ratings, in a table of their own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from onedemo.storage.database import Database, now
 from onedemo.storage.ratings import LOOKED_BACK, AlreadyAnswered
@@ -175,3 +176,56 @@ class Comparisons:
             f"SELECT {', '.join(COMPARISON_COLUMNS)} FROM answers WHERE ?1 IS NULL OR run = ?1 ORDER BY id",
             (run,),
         )
+
+    def stream_history(self, run: str | None = None) -> Iterator[tuple]:
+        """What ``stream`` does not give, as ``Ratings.stream_history``: skips, undos, what was taken back."""
+        return self._database.stream(
+            "SELECT c.id, NULL, c.pair_id, p.run, a.name, c.answer, NULL, 0, NULL, NULL, NULL, NULL, NULL,"
+            " c.latency_ms, c.created_at, NULL"
+            " FROM comparisons c JOIN pairs p ON p.id = c.pair_id JOIN raters a ON a.id = c.rater_id"
+            " WHERE (?1 IS NULL OR p.run = ?1) AND (c.answer IN ('skip', 'undo') OR EXISTS ("
+            "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
+            "  AND l.id > c.id)) ORDER BY c.id",
+            (run,),
+        )
+
+    def compared(self, run: str | None = None) -> Iterator[tuple[int, str, NewPair]]:
+        """Every pair of which anybody ever said anything: its number, run and content, streamed."""
+        rows = self._database.stream(
+            "SELECT id, run, demo_step, stage, iteration, left_segment, right_segment FROM pairs"
+            " WHERE (?1 IS NULL OR run = ?1) AND id IN (SELECT pair_id FROM comparisons) ORDER BY id",
+            (run,),
+        )
+        for number, of_run, step, stage, iteration, left, right in rows:
+            pair = NewPair(
+                demo_step=step, stage=stage, iteration=iteration, left=unpack_segment(left),
+                right=unpack_segment(right),
+            )  # fmt: skip
+            yield number, of_run, pair
+
+    def restore_pairs(self, pairs: Iterable[tuple[int, str, NewPair]]) -> dict[int, str]:
+        """Stores pairs of an export under the numbers they had; nobody is asked them.
+
+        Returns:
+            The run of each, by its number.
+        """
+        numbers = {}
+        with self._database.transaction() as db:
+            for number, run, pair in pairs:
+                db.execute(
+                    "INSERT INTO pairs (id, run, demo_step, steps, stage, iteration, left_segment,"
+                    " right_segment, state, created_at) VALUES (?, ?, ?, ?, ?, ?, ?, ?, 'withdrawn', ?)",
+                    (number, run, pair.demo_step, len(pair.left), pair.stage, pair.iteration,
+                     pack_segment(pair.left), pack_segment(pair.right), now()),
+                )  # fmt: skip
+                numbers[number] = run
+        return numbers
+
+    def restore(self, row: Mapping[str, Any]) -> None:
+        """Stores what was said of a pair as it was: a row of the table ``comparisons``."""
+        names = ("id", "pair_id", "rater_id", "answer", "latency_ms", "created_at")
+        with self._database.transaction() as db:
+            db.execute(
+                f"INSERT INTO comparisons ({', '.join(names)}) VALUES (:{', :'.join(names)})",
+                {name: row[name] for name in names},
+            )

@@ -17,9 +17,14 @@ RATING_COLUMNS = (
 """Columns of the view ``ratings``, in order."""
 SKIP_COLUMNS = (
     "id", "clip_id", "run", "demo", "rater", "reason", "stage", "iteration", "created_at", "latency_ms",
-    "demo_step", "steps", "repeat",
+    "demo_step", "steps", "repeat", "snapshot", "predicted",
 )  # fmt: skip
 """Of a skip, in order."""
+HISTORY_COLUMNS = (
+    "id", "clip_id", "pair_id", "run", "rater", "kind", "value", "repeat", "mark_start", "mark_end",
+    "reason", "snapshot", "predicted", "latency_ms", "created_at", "by",
+)  # fmt: skip
+"""Of an event that does not hold any more, or is about a rater, in order."""
 LOOKED_BACK = 400
 """Events of a rater among which what may be taken back is looked for: every open page asks twice a second."""
 MOST_REASON = 200
@@ -204,7 +209,8 @@ class Ratings:
     def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
         """The rating or skip that a rater gave last in a run, of those that hold; None if there is none.
 
-        Only among the rater's last 400 events, and only of clips that can be shown again: those of an import have no picture.
+        Only among the rater's last 400 events, and only of clips that can be shown again: those of an import
+        have no picture.
         """
         rows = self._database.rows(
             "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
@@ -320,7 +326,7 @@ class Ratings:
             " MAX(e.latency_ms, CASE WHEN e.reason IS NULL THEN 0 ELSE COALESCE(("
             "  SELECT f.latency_ms FROM events f WHERE f.clip_id = e.clip_id AND f.rater_id = e.rater_id"
             "  AND f.repeat = e.repeat AND f.kind = 'skip' AND f.id < e.id ORDER BY f.id DESC LIMIT 1"
-            " ), 0) END), c.demo_step, c.steps, e.repeat"
+            " ), 0) END), c.demo_step, c.steps, e.repeat, e.snapshot, e.predicted"
             " FROM events e JOIN clips c ON c.id = e.clip_id JOIN runs r ON r.id = c.run"
             " JOIN raters p ON p.id = e.rater_id"
             " WHERE e.kind = 'skip' AND (?1 IS NULL OR c.run = ?1) AND NOT EXISTS ("
@@ -336,17 +342,42 @@ class Ratings:
         )
         return rows[::-1]
 
-    def restore(self, row: Mapping[str, Any], rater_id: int) -> None:
-        """Stores a rating of an export as it was: number, time and prediction."""
+    def stream_history(self, run: str | None = None) -> Iterator[tuple]:
+        """What neither ``stream`` nor ``stream_skips`` gives: values of ``HISTORY_COLUMNS``, streamed.
+
+        Undos and what they took back, skips whose reason came later, and who was left out of training.
+        """
+        return self._database.stream(
+            "SELECT e.id, e.clip_id, NULL, COALESCE(e.run, c.run), p.name, e.kind, e.value, e.repeat,"
+            " ROUND(e.mark_from * r.step_seconds, 6), ROUND(e.mark_to * r.step_seconds, 6), e.reason,"
+            " e.snapshot, e.predicted, e.latency_ms, e.created_at, b.name"
+            " FROM events e LEFT JOIN clips c ON c.id = e.clip_id"
+            " JOIN runs r ON r.id = COALESCE(e.run, c.run) JOIN raters p ON p.id = e.rater_id"
+            " LEFT JOIN raters b ON b.id = e.by_id"
+            " WHERE (?1 IS NULL OR r.id = ?1) AND (e.kind NOT IN ('rate', 'skip') OR EXISTS ("
+            "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
+            "  AND l.repeat = e.repeat AND l.id > e.id)) ORDER BY e.id",
+            (run,),
+        )
+
+    def restore(self, row: Mapping[str, Any]) -> None:
+        """Stores an event of an export as it was: number, time and prediction.
+
+        Args:
+            row: Of the table ``events``, but "mark_start" and "mark_end" in seconds.
+        """
+        names = (
+            "id", "clip_id", "rater_id", "kind", "value", "repeat", "reason", "snapshot", "predicted",
+            "latency_ms", "run", "by_id", "created_at",
+        )  # fmt: skip
         with self._database.transaction() as db:
-            names = ("id", "clip_id", "value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
             db.execute(
-                f"INSERT INTO events (rater_id, kind, {', '.join(names)}, mark_from, mark_to)"
-                f" SELECT :rater_id, 'rate', :{', :'.join(names)}, first, MIN(steps, MAX(first + 1, after))"
+                f"INSERT INTO events ({', '.join(names)}, mark_from, mark_to)"
+                f" SELECT :{', :'.join(names)}, first, MIN(steps, MAX(first + 1, after))"
                 " FROM (SELECT c.steps, MIN(c.steps - 1, ROUND(:mark_start / r.step_seconds)) AS first,"
                 " ROUND(:mark_end / r.step_seconds) AS after"
-                " FROM clips c JOIN runs r ON r.id = c.run WHERE c.id = :clip_id)",
-                {**row, "rater_id": rater_id},
+                " FROM (SELECT 1) LEFT JOIN clips c ON c.id = :clip_id LEFT JOIN runs r ON r.id = c.run)",
+                {name: row.get(name) for name in (*names, "mark_start", "mark_end")},
             )
 
 

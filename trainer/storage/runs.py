@@ -17,9 +17,19 @@ class Runs:
 
     def add(
         self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str,
-        step_seconds: float = 0.008,
+        step_seconds: float = 0.008, created_at: str | None = None,
     ) -> None:  # fmt: skip
-        """Records a new run; ``step_seconds`` is the length of its robot's control step.
+        """Records a new run.
+
+        Args:
+            run: Its name.
+            demo: What is to be learned.
+            demo_sha256: Of that video.
+            seed: Of everything random.
+            config: Its settings, TOML.
+            version: Of the program that made it.
+            step_seconds: Length of its robot's control step.
+            created_at: When it was made, if not now.
 
         Raises:
             UserError: If a run of that name exists.
@@ -30,14 +40,14 @@ class Runs:
                     "INSERT INTO runs"
                     " (id, demo, demo_sha256, seed, config, version, created_at, step_seconds)"
                     " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                    (run, demo, demo_sha256, seed, config, version, now(), step_seconds),
+                    (run, demo, demo_sha256, seed, config, version, created_at or now(), step_seconds),
                 )
             except sqlite3.IntegrityError:
                 raise UserError(f"run {run!r} exists already; choose another name") from None
 
     def all(self) -> list[dict]:
-        """All runs, oldest first, as {id, demo, demo_sha256, seed, config, version, created_at}."""
-        names = ("id", "demo", "demo_sha256", "seed", "config", "version", "created_at")
+        """All runs, oldest first: id, demo, demo_sha256, seed, config, version, created_at, step_seconds."""
+        names = ("id", "demo", "demo_sha256", "seed", "config", "version", "created_at", "step_seconds")
         rows = self._database.rows(f"SELECT {', '.join(names)} FROM runs ORDER BY rowid")
         return [dict(zip(names, row, strict=True)) for row in rows]
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from onedemo.config import RunConfig, load_config, to_toml
 from onedemo.core.files import write_atomic
-from onedemo.core.names import check_name
+from onedemo.core.names import check_name, check_new_name
 from onedemo.errors import UserError
 from onedemo.sim.vector_env import spec
 from onedemo.storage.run_directory import RunDirectory
@@ -109,7 +109,7 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
     """
     lengths(config, demo.frames, demo.fps)
     if name is not None:
-        check_name(name)
+        check_new_name(check_name(name))
     else:
         taken = {r["id"] for r in store.runs.all()}
         name = next(n for k in count(1) if (n := f"{demo.name}-{k}") not in taken)

@@ -25,6 +25,7 @@ import torch
 from torch import nn
 
 from onedemo.core.files import read_whole, write_atomic
+from onedemo.core.names import check_name
 from onedemo.demos.library import stream_frames
 from onedemo.errors import UserError
 from onedemo.types import Demo
@@ -93,7 +94,7 @@ def demo_features(demo: Demo, encoder: Encoder, cache_dir: Path) -> np.ndarray:
     Raises:
         UserError: If the demo's video cannot be read.
     """
-    path = Path(cache_dir) / demo.sha256 / f"features-{encoder.name}.npz"
+    path = Path(cache_dir) / check_name(demo.sha256) / f"features-{encoder.name}.npz"
     shape = (demo.frames, encoder.dims)
     if (data := read_whole(path)) is not None:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored, suppress(ValueError, KeyError):

@@ -23,6 +23,7 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
+from onedemo.core.names import check_name
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics, vector_env
@@ -125,7 +126,7 @@ def learn(
     """
     spec = vector_env.spec(env_name)
     model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
-    path = cache_dir / f"{env_name}-{model}-{encoder.name}-v{_VERSION}.npz"
+    path = cache_dir / f"{check_name(env_name)}-{model}-{encoder.name}-v{_VERSION}.npz"
     if (data := read_whole(path)) is not None:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             return PoseEstimator(stored)

@@ -97,7 +97,7 @@ def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
 
 def test_ratings_may_come_while_a_backup_is_made(data_dir, tmp_path):
     with closing(Store(data_dir)) as store:
-        clips = [clip.id for clip, _ in store.clips.rated()]
+        clips = [clip.id for clip, _ in store.clips.answered()]
         before = store.ratings.last_event()
         stop = threading.Event()
 

@@ -11,7 +11,7 @@ from helpers.paths import ROOT
 from helpers.small_world import Thumbnail, falling_demo, small_config
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.card import card
-from onedemo.app.dataset.columns import COMPARISONS, RATINGS, SEGMENTS, SKIPS, as_table
+from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.config import load_config
 from onedemo.reward.dataset import TrainingSet
 from onedemo.storage.ratings import RATING_COLUMNS
@@ -47,7 +47,7 @@ def study(tmp_path_factory):
         while training.step() != "done":
             pass
         ada, bob = store.accounts.ensure("Ada", "researcher"), store.accounts.ensure("@Bob | co", "annotator")
-        first = next(clip for clip, _ in store.clips.rated()).id
+        first = next(clip for clip, _ in store.clips.answered()).id
         store.ratings.rate(first, bob.id, 5, 1200)
         store.ratings.rate(first, bob.id, 4, 900, repeat=True)
         store.ratings.rate(first, ada.id, 1, 700)
@@ -70,7 +70,7 @@ def test_the_export_is_what_the_columns_say(study):
     assert table.column_names == list(SEGMENTS)
     assert table.column("clip_id").to_pylist() == sorted({int(row["clip_id"]) for row in rows})
     with closing(Store(data_dir)) as store:
-        clip, segment = next(iter(store.clips.rated()))
+        clip, segment = next(iter(store.clips.answered()))
         row = table.slice(0, 1).to_pylist()[0]
         assert row["clip_id"] == clip.id and np.array_equal(np.array(row["qpos"]), segment.qpos)
 
@@ -113,11 +113,14 @@ def leaves(tree):
 def damaged(text, lines):
     rows = text.splitlines(keepends=True)
     return {
-        "a rating of 9": (rows[0] + lines[0].replace(",rule,3,", ",rule,9,"), "value must be 1 to 5"),
+        "a rating of 9": (
+            rows[0] + lines[0].replace(",rule,3,", ",rule,9,"),
+            "value is '9', not a whole number from 1 to 5",
+        ),
         "an unknown clip": (rows[0] + "1,99999," + lines[0].split(",", 2)[2], "clip 99999 is not in"),
-        "the same twice": (rows[0] + lines[0] + lines[0], "line 3: UNIQUE"),
+        "the same twice": (rows[0] + lines[0] + lines[0], "line 3: rating"),
         "no header": ("".join(rows[1:]), "has no column"),
-        "not a number": (rows[0] + "x," + lines[0].split(",", 1)[1], "line 2: invalid literal"),
+        "not a number": (rows[0] + "x," + lines[0].split(",", 1)[1], "line 2: id is 'x', not a whole number"),
     }
 
 
@@ -175,5 +178,5 @@ def test_an_export_of_one_rater(study, capfdbinary):
 
 def test_the_documentation_has_the_columns():
     text = (ROOT / "docs" / "data.md").read_text()
-    for columns in (RATINGS, SEGMENTS, COMPARISONS, SKIPS):
+    for columns in (RATINGS, SEGMENTS, COMPARISONS, PAIRS, SKIPS, HISTORY):
         assert as_table(columns) in text

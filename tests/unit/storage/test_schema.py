@@ -139,12 +139,11 @@ def test_marks_between_steps_are_rounded_as_they_were_read(tmp_path):
 
 def test_marks_of_an_export_are_kept_within_their_clip(tmp_path):
     put_marks(tmp_path, 37, [(0.1, 0.2)])
-    names = ("value", "repeat", "snapshot", "predicted", "latency_ms", "created_at")
-    row = dict(zip(names, (2, 1, 1, None, 900, ""), strict=True))
+    row = {"kind": "rate", "value": 2, "repeat": 1, "snapshot": 1, "latency_ms": 900, "created_at": ""}
     with closing(Store(tmp_path)) as store:
         for number, (start, end) in enumerate([(0.3, 0.333), (0.08, 0.08), (0.08, 0.16)], start=900):
-            mark = {"id": number, "clip_id": 100, "mark_start": start, "mark_end": end}
-            store.ratings.restore(row | mark, 2)
+            mark = {"id": number, "clip_id": 100, "rater_id": 2, "mark_start": start, "mark_end": end}
+            store.ratings.restore(row | mark)
         kept = store.database.rows("SELECT mark_from, mark_to FROM events WHERE id >= 900 ORDER BY id")
     assert kept == [(36, 37), (10, 11), (10, 20)]
 

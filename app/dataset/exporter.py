@@ -1,0 +1,58 @@
+"""Everything that people gave, as files that ``onedemo import`` takes in again."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from itertools import chain
+from pathlib import Path
+
+from onedemo.app.dataset.card import card
+from onedemo.app.dataset.parquet import write_pairs, write_segments
+from onedemo.app.dataset.ratings_csv import csv_blocks
+from onedemo.core.files import replacing, write_atomic
+from onedemo.storage.comparisons import COMPARISON_COLUMNS
+from onedemo.storage.ratings import HISTORY_COLUMNS, RATING_COLUMNS, SKIP_COLUMNS
+from onedemo.storage.store import Store
+
+FILES = (
+    "history.csv", "ratings.csv", "skips.csv", "comparisons.csv", "pairs.parquet", "segments.parquet",
+    "card.md",
+)  # fmt: skip
+"""Of a whole export, in the order in which they are written: people may go on rating meanwhile. What does
+not hold any more stays so, and whatever an event is about was there before it."""
+
+
+def write_export(store: Store, run: str | None, directory: Path) -> None:
+    """Writes the files of a whole export, of one run or of all; each is there once it is whole.
+
+    Raises:
+        OSError: If one cannot be written.
+    """
+    for name in FILES:
+        write_file(store, run, name, directory / name)
+
+
+def write_file(store: Store, run: str | None, name: str, file: Path) -> None:
+    """Writes one of ``FILES`` under another name; a file that is there is replaced once it is whole."""
+    if name == "segments.parquet":
+        runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
+        roles = {rater.name: rater.role for rater in store.accounts.raters()}
+        with replacing(file) as half:
+            write_segments(half, store.clips.answered(run), runs, roles)
+    elif name == "pairs.parquet":
+        with replacing(file) as half:
+            write_pairs(half, store.comparisons.compared(run))
+    else:
+        write_atomic(file, card(store, run).encode() if name == "card.md" else csv_of(store, run, name))
+
+
+def csv_of(store: Store, run: str | None, name: str) -> Generator[bytes, None, None]:
+    """One of the CSVs of ``FILES``, in blocks."""
+    if name == "history.csv":
+        rows = chain(store.ratings.stream_history(run), store.comparisons.stream_history(run))
+        return csv_blocks(rows, HISTORY_COLUMNS)
+    if name == "comparisons.csv":
+        return csv_blocks(store.comparisons.stream(run), COMPARISON_COLUMNS)
+    if name == "skips.csv":
+        return csv_blocks(store.ratings.stream_skips(run), SKIP_COLUMNS)
+    return csv_blocks(store.ratings.stream(run), RATING_COLUMNS)
