@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from aiohttp import web
 
@@ -13,6 +14,7 @@ from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.storage.store import Store
 
+_T = TypeVar("_T")
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Addresses of what differs between runs or demos end in ?v= and what they are of."""
 
@@ -103,7 +105,7 @@ class Files:
 
     async def demo_frame(self, request: web.Request) -> web.StreamResponse:
         """A frame of the demo."""
-        frames = await asyncio.to_thread(self._page.pictures.frames)
+        frames = await _of_demo(self._page.pictures.frames)
         index = int(request.match_info["index"])
         if index >= len(frames):
             raise web.HTTPNotFound()
@@ -111,11 +113,18 @@ class Files:
 
     async def demo_example(self, request: web.Request) -> web.StreamResponse:
         """A clip of the guide."""
-        examples = await asyncio.to_thread(self._page.pictures.examples)
+        examples = await _of_demo(self._page.pictures.examples)
         example = examples.get(request.match_info["name"])
         if example is None:
             raise web.HTTPNotFound()
         return web.Response(body=example, content_type="image/jpeg", headers=_KEEP)
+
+
+async def _of_demo(pictures: Callable[[], _T]) -> _T:
+    try:
+        return await asyncio.to_thread(pictures)
+    except UserError:  # its video is gone; the page says so, and the log has
+        raise web.HTTPNotFound(text="The demonstration's video is gone.") from None
 
 
 def _jpeg(path: Path) -> web.FileResponse:
