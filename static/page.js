@@ -403,7 +403,9 @@
     request.onload = () => {
       if (request.status !== 200) return done(request.responseText);
       const choice = document.querySelector(".od-new-run select[name=demo]");
-      choice?.add(new Option(form.elements.name.value));
+      const name = request.getResponseHeader("X-Demo");
+      if (choice && ![...choice.options].some((option) => option.value === name)) choice.add(new Option(name));
+      if (choice) choice.value = name;
       form.reset();
       done(request.responseText);
     };

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import sqlite3
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.core.files import archive_fault, jpeg_fault
-from onedemo.demos.library import list_demos
+from onedemo.demos.library import is_whole, list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.database import FILE_NAME
@@ -190,10 +189,19 @@ def _files(data_dir: Path) -> Iterator[Finding]:
 def _demos(data_dir: Path) -> Iterator[Finding]:
     there = [path.parent for path in (data_dir / "demos").glob("*/demo.json")]
     known = {demo.path.parent: demo for demo in list_demos(data_dir / "demos")}
-    broken = [path for path in there if path not in known or _sha256(known[path].path) != known[path].sha256]
+    broken = [path for path in there if path not in known or not is_whole(known[path])]
+    with closing(_open(data_dir / FILE_NAME)) as db:
+        wanted = db.execute("SELECT id, demo, demo_sha256 FROM runs").fetchall()
+    whole = {demo.sha256 for demo in list_demos(data_dir / "demos")}
+    lost = [(run, demo, sha256) for run, demo, sha256 in wanted if sha256 not in whole]
+    for run, demo, sha256 in lost[:_NAMED]:
+        yield Finding(
+            "demonstrations", False,
+            f"run {run} cannot go on, its demo {demo} is gone: put demos/{sha256} back from a backup",
+        )  # fmt: skip
     if broken:
         yield Finding("demonstrations", False, f"{_name(broken)} damaged: delete it and add the video again")
-    else:
+    elif not lost:
         yield Finding("demonstrations", True, f"{_count(len(there), 'video')} of your own, as brought in")
 
 
@@ -212,11 +220,6 @@ def _fault(path: Path, fault: Callable[[bytes], str]) -> bool:
         return False
     except OSError:
         return True
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _name(paths: list[Path]) -> str:

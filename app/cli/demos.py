@@ -1,8 +1,11 @@
-"""The commands for demonstration videos: ``demo add``, ``demo list``, ``demo show``."""
+"""The commands for demonstration videos: ``demo add``, ``list``, ``show``, ``rename``, ``remove``."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cyclopts import App
 
@@ -10,18 +13,22 @@ from onedemo.app.cli.data import DATA, DataDir
 from onedemo.core.outputs import check_data_dir
 from onedemo.errors import UserError
 
+if TYPE_CHECKING:
+    from onedemo.storage.store import Store
+
 demo = App(name="demo", help="Bring in and look at demonstration videos.")
 
 
 @demo.command
 def add(
-    video: Path, /, *, name: str, start: float | None = None, end: float | None = None,
+    video: Path, /, *others: Path, name: str, start: float | None = None, end: float | None = None,
     crop: str | None = None, mirror: bool = False, fps: float = 30.0, data_dir: DataDir = DATA,
 ) -> None:  # fmt: skip
     """Bring in a video.
 
     Args:
-        video: Any file that OpenCV decodes: mp4, webm, mov, avi, gif.
+        video: Any video file that FFmpeg decodes: mp4, mov, webm, mkv, avi, gif and many more.
+        others: None: a demo is made of one video.
         name: What to call it.
         start: Begin at this second.
         end: End at this second.
@@ -32,6 +39,11 @@ def add(
     from onedemo.demos.import_checks import read_crop
     from onedemo.demos.library import import_video
 
+    if others:
+        raise UserError(
+            f"a demo is made of one video, got {1 + len(others)} files; if they are pictures, make a video "
+            "of them first: ffmpeg -framerate 30 -i %04d.png -pix_fmt yuv420p y.mp4"
+        )
     try:
         rectangle = read_crop(crop) if crop is not None else None
     except ValueError as error:
@@ -62,3 +74,64 @@ def show(name: str, /, *, data_dir: DataDir = DATA) -> None:
     from onedemo.demos.library import find_demo, show
 
     print(show(find_demo(name, data_dir / "demos")))
+
+
+@demo.command
+def rename(old: str, new: str, /, *, data_dir: DataDir = DATA) -> None:
+    """Give a demo another name; its runs go on.
+
+    Args:
+        old: Its name.
+        new: What to call it.
+    """
+    from onedemo.demos.library import find_demo, rename_demo
+
+    found = find_demo(old, data_dir / "demos")
+    rename_demo(found, new, data_dir / "demos")
+    with _store(data_dir) as store:
+        if store is not None:
+            store.runs.rename_demo(found.sha256, new)
+    print(f"{old} is called {new} now")
+
+
+@demo.command
+def remove(name: str, /, *, data_dir: DataDir = DATA) -> None:
+    """Delete a demo that no run learns from.
+
+    Args:
+        name: Its name.
+    """
+    from onedemo.demos.library import find_demo, remove_demo
+
+    found = find_demo(name, data_dir / "demos")
+    with _store(data_dir) as store:
+        known = [] if store is None else store.runs.all()
+    runs = [run["id"] for run in known if run["demo_sha256"] == found.sha256]
+    if runs:
+        raise UserError(
+            f"the demo {name} is what {_named(runs)} from, and could not go on without it; if its name is "
+            f"wanted, give it another: onedemo demo rename {name} NEW"
+        )
+    remove_demo(found, data_dir / "demos")
+    print(f"{name} is deleted")
+
+
+@contextmanager
+def _store(data_dir: Path) -> Iterator[Store | None]:
+    """The database, if there is one."""
+    from onedemo.storage.database import FILE_NAME
+    from onedemo.storage.store import Store
+
+    if not (data_dir / FILE_NAME).exists():
+        yield None
+        return
+    store = Store(data_dir)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def _named(runs: list[str]) -> str:
+    shown = ", ".join(runs[:3]) + (f" and {len(runs) - 3} more" if len(runs) > 3 else "")
+    return f"run {shown} learns" if len(runs) == 1 else f"runs {shown} learn"

@@ -120,7 +120,11 @@ class Files:
 
     async def _of_demo(self, what: Callable[[Pictures], T]) -> T:
         """Made on first use, which takes seconds, by one thread however many pages ask."""
-        return await asyncio.get_running_loop().run_in_executor(self._preparing, what, self._page.pictures)
+        preparing = asyncio.get_running_loop().run_in_executor(self._preparing, what, self._page.pictures)
+        try:
+            return await preparing
+        except UserError:  # its video is gone; the page says so, and the log has
+            raise web.HTTPNotFound(text="The demonstration's video is gone.") from None
 
 
 async def _file(ask: Callable[..., Future[Path]], *what: Any) -> web.FileResponse:

@@ -51,7 +51,7 @@ class Uploads:
     async def add(self, request: web.Request) -> web.Response:
         """Answers a form with ``name``, if wanted ``start``, ``end``, ``crop``, ``mirror``, last ``video``.
 
-        The answer is one sentence: what the demo is now, or what was wrong.
+        The answer is one sentence: what the demo is now, or what was wrong; ``X-Demo`` is the demo's name.
         """
         if self._open >= MOST_AT_ONCE:
             raise web.HTTPServiceUnavailable(text="Other videos are being uploaded; try again in a minute.")
@@ -83,7 +83,11 @@ class Uploads:
             if path is not None:
                 with suppress(OSError):
                     path.unlink()
-        return web.Response(text=f"{demo.name} is a demo now: {demo.seconds:.1f} s, {demo.frames} frames.")
+        known = demo.name != fields["name"]
+        said = f"This video is known already, as {demo.name}" if known else f"{demo.name} is a demo now"
+        return web.Response(
+            text=f"{said}: {demo.seconds:.1f} s, {demo.frames} frames.", headers={"X-Demo": demo.name}
+        )
 
     async def _receive(self, request: web.Request, file: Any) -> dict[str, str]:
         """Writes the video to the file; returns the other fields. The file's own name is not looked at."""

@@ -5,6 +5,7 @@ Both are made once, on first use, and kept encoded (a few megabytes).
 
 from __future__ import annotations
 
+import logging
 import threading
 import zlib
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from onedemo.demos.library import read_frames
+from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.storage.store import Store
 from onedemo.types import Demo
@@ -20,6 +22,8 @@ from onedemo.types import Demo
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640
 _CLIP_SECONDS = 0.3
+
+_log = logging.getLogger(__name__)
 
 
 def version_of(store: Store, run: str) -> str:
@@ -45,9 +49,14 @@ class Pictures:
         self._lock = threading.Lock()
         self._frames: list[bytes] | None = None
         self._examples: dict[str, bytes] = {}
+        self._told = False
 
     def frames(self) -> list[bytes]:
-        """Every frame of the demo as JPEG, in order."""
+        """Every frame of the demo as JPEG, in order.
+
+        Raises:
+            UserError: If the stored video is gone or damaged; this is logged once.
+        """
         with self._lock:
             if self._frames is None:
                 self._prepare()
@@ -55,14 +64,24 @@ class Pictures:
             return self._frames
 
     def examples(self) -> dict[str, bytes]:
-        """Clips "same", "near", "other" and "far": the demo beside itself at growing distance."""
+        """Clips "same", "near", "other" and "far": the demo beside itself at growing distance.
+
+        Raises:
+            UserError: As ``frames``.
+        """
         with self._lock:
             if self._frames is None:
                 self._prepare()
             return self._examples
 
     def _prepare(self) -> None:
-        frames = self._read(self.demo)
+        try:
+            frames = self._read(self.demo)
+        except UserError as error:
+            if not self._told:  # pages ask for hundreds of pictures
+                self._told = True
+                _log.error("%s", error)
+            raise
         length = min(len(frames), max(2, round(_CLIP_SECONDS * self.demo.fps)))
         moments = example_moments(frames, length=length)
         examples = {}

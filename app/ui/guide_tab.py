@@ -12,6 +12,7 @@ from onedemo.app.templates import render
 from onedemo.app.ui.clip_player import example_address, player_html
 from onedemo.app.ui.context import TabContext
 from onedemo.app.ui.strings import RATE_KEYS
+from onedemo.errors import UserError
 from onedemo.types import Status
 
 log = logging.getLogger("onedemo.page")
@@ -46,6 +47,8 @@ class Guide:
         try:
             self._pictures.examples()
             self._html.content = str(guide_html(self._pictures.demo.fps, self._pictures.demo.sha256))
+        except UserError:  # the demo's video is gone: logged, and said on top of the page
+            pass
         except Exception:
             log.exception("the examples of the guide could not be made")
 

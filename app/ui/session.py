@@ -191,11 +191,16 @@ class Session:
             if self._closed:
                 return
             # Not atomic: tabs ask the database here, and messages of a press would wait for that.
-            banner = str(render("session.html:banner", status=status))
+            banner = str(render("session.html:banner", status=status, lost=self._lost()))
             if banner != self._banner:
                 self._banner = self._notice.content = banner
             for tab in self._tabs:
                 tab.refresh(status)
+
+    def _lost(self) -> str:
+        """The name of the demo if its video is gone."""
+        demo = self._context.demo
+        return "" if demo.path.is_file() else demo.name
 
     def close(self) -> None:
         """Lets go of everything the session held."""

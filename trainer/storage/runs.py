@@ -51,6 +51,11 @@ class Runs:
         rows = self._database.rows(f"SELECT {', '.join(names)} FROM runs ORDER BY rowid")
         return [dict(zip(names, row, strict=True)) for row in rows]
 
+    def rename_demo(self, demo_sha256: str, name: str) -> None:
+        """Gives the demo of some runs the name that it has from now on."""
+        with self._database.transaction() as db:
+            db.execute("UPDATE runs SET demo = ? WHERE demo_sha256 = ?", (name, demo_sha256))
+
     def add_snapshot(self, run: str, number: int, *, last_event: int, ratings: int, stats: dict) -> None:
         """Records a snapshot whose file is on disk already."""
         with self._database.transaction() as db:

@@ -2,8 +2,10 @@
 
 import json
 import logging
+import re
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cv2
@@ -13,6 +15,7 @@ from PIL import Image
 
 from helpers.paths import PERSON, ROOT
 from onedemo.demos import library as demos
+from onedemo.demos.decoder_child import shaped_frames
 from onedemo.demos.library import find_demo, import_video, list_demos, read_frames, render_demo, show
 from onedemo.demos.resampling import resample
 from onedemo.demos.video import VideoReader, count_frames, write_webm
@@ -60,6 +63,18 @@ def make_video(path, count=30, fps=30.0, size=(WIDTH, HEIGHT), picture=numbered)
     return path
 
 
+@pytest.fixture(autouse=True)
+def quickly(request, monkeypatch):
+    """Decodes in this process, but for tests that are marked ``seam``: the child has tests of its own."""
+    if request.node.get_closest_marker("seam") is None:
+        monkeypatch.setattr(demos, "decode", lambda path, options, limits: in_process(path, options))
+
+
+def in_process(path, options):
+    with path.open("rb") as file:
+        yield from shaped_frames(file, str(path), options)
+
+
 @pytest.fixture
 def library(tmp_path):
     return tmp_path / "demos"
@@ -85,6 +100,7 @@ def refused(path, library, **options):
 # --- what comes in --------------------------------------------------------------------------------
 
 
+@pytest.mark.seam
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".avi", ".mkv", ".webm"])
 def test_every_container_keeps_every_frame(tmp_path, library, suffix):
     path = make_video(tmp_path / f"move{suffix}")
@@ -136,10 +152,10 @@ def test_trim_crop_and_mirror(video, library):
 
 
 def test_large_odd_pictures_are_scaled_to_even_sides(tmp_path, library):
-    path = make_video(tmp_path / "big.avi", count=9, size=(1000, 1600))
+    path = make_video(tmp_path / "big.avi", count=9, size=(500, 800))
     demo = import_video(path, name="big", demos_dir=library)
     assert (demo.width, demo.height) == (400, 640)
-    odd = import_video(path, name="odd", demos_dir=library, crop=(300, 700, 333, 333))
+    odd = import_video(path, name="odd", demos_dir=library, crop=(150, 300, 333, 333))
     assert (odd.width, odd.height) == (332, 332)
 
 
@@ -184,6 +200,7 @@ def test_files_that_are_no_video(tmp_path, library):
         assert "is not a video that can be read" in refused(tmp_path / name, library)
 
 
+@pytest.mark.seam
 def test_files_that_are_no_video_print_nothing(tmp_path, library, capfd):
     (tmp_path / "text.mp4").write_bytes(b"hello " * 999)
     refused(tmp_path / "text.mp4", library)
@@ -379,3 +396,124 @@ def test_a_real_person(library):
     demo = import_video(PERSON, name="person", demos_dir=library, end=1.0)
     assert (demo.frames, demo.width, demo.height) == (30, 480, 480)
     assert read_frames(demo).std() > 20
+
+
+# --- what a demo is, and its name -----------------------------------------------------------------
+
+
+def test_the_same_video_is_the_same_demo_everywhere(video, tmp_path):
+    """The container holds a random number; exported ratings meet the same demo elsewhere, or added again."""
+    one, two = (import_video(video, name="move", demos_dir=tmp_path / each) for each in "ab")
+    assert one.sha256 == two.sha256
+    demos.remove_demo(one, tmp_path / "a")
+    assert import_video(video, name="again", demos_dir=tmp_path / "a").sha256 == one.sha256
+    assert demos.is_whole(two)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"end": 10.0}, {"end": np.inf}, {"crop": (0, 0, WIDTH, HEIGHT)}, {"start": -0.0}, {"start": 1e-9}],
+)
+def test_other_options_that_give_the_same_pictures_are_the_same_demo(video, library, options):
+    first = import_video(video, name="move", demos_dir=library)
+    assert import_video(video, name="other", demos_dir=library, **options) == first
+
+
+def test_a_demo_of_before_stays_readable_and_is_found_again(video, library):
+    """Its sha256 was that of the file, which named the directory."""
+    demo = import_video(video, name="move", demos_dir=library)
+    about = json.loads((demo.path.parent / "demo.json").read_text())
+    of_file = about.pop("video_sha256")
+    old = library / of_file
+    demo.path.parent.rename(old)
+    (old / "demo.json").write_text(json.dumps(about | {"sha256": of_file}))
+    kept = find_demo("move", library)
+    assert kept.sha256 == of_file and demos.is_whole(kept) and numbers(kept) == list(range(30))
+    assert import_video(video, name="other", demos_dir=library) == kept
+    kept.path.write_bytes(kept.path.read_bytes()[:-1] + b"x")
+    assert not demos.is_whole(kept)
+
+
+def test_of_two_that_are_added_under_one_name_at_once_one_wins(video, tmp_path, library):
+    other = make_video(tmp_path / "other.avi", count=12)
+    outcomes = []
+
+    def add(path):
+        try:
+            outcomes.append(import_video(path, name="move", demos_dir=library).name)
+        except UserError as error:
+            outcomes.append(str(error))
+
+    threads = [threading.Thread(target=add, args=(path,)) for path in (video, other)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(outcomes) == ["move", "the name move is taken by another demo; choose another --name"]
+    assert len(list(library.iterdir())) == 1
+
+
+def test_rename_and_remove(video, library, tmp_path):
+    demo = import_video(video, name="move", demos_dir=library)
+    renamed = demos.rename_demo(demo, "better", library)
+    assert find_demo("better", library) == renamed and renamed.sha256 == demo.sha256
+    with pytest.raises(UserError, match="no demo called 'move'"):
+        find_demo("move", library)
+    with pytest.raises(UserError, match="taken"):
+        demos.rename_demo(renamed, "hopper-hop", library)
+    with pytest.raises(UserError, match="letters"):
+        demos.rename_demo(renamed, "../up", library)
+    for change in (demos.remove_demo, lambda demo, place: demos.rename_demo(demo, "x", place)):
+        with pytest.raises(UserError, match="comes with the program"):
+            change(find_demo("hopper-hop", library), library)
+    demos.remove_demo(renamed, library)
+    assert list(library.iterdir()) == []
+
+
+def test_what_was_stored_is_compared_with_what_came_in(video, library, monkeypatch):
+    """As if the encoder stored black, as OpenCV decoded interlaced video."""
+    monkeypatch.setattr(demos, "write_webm", lambda path, frames, fps: write_webm(
+        path, (frame * (number < 20) for number, frame in enumerate(frames)), fps=fps))  # fmt: skip
+    assert "frame 20 was not stored as it came in" in refused(video, library)
+
+
+# --- what people give by mistake ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("https://www.youtube.com/watch?v=x", "is a web address: download the video"),
+        ("/dev/video0", "is a camera"),
+        ("0", "is a camera"),
+        ("/dev/null", "is a device"),
+        ("frames/%04d.png", "stands for several files; .* ffmpeg -framerate 30"),
+        ("frames/*.png", "stands for several files"),
+        ("nowhere.mp4", "no video file at nowhere.mp4"),
+        ("x" * 300, "no video file at"),
+        ("a\0b", "no video file at"),
+    ],
+)
+def test_what_is_no_file_is_named(library, given, words):
+    assert re.search(words, refused(given, library))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"\n<html lang=en>", "is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "is a Git LFS pointer"),
+        (b"PK\x03\x04" + b"x" * 99, "is an archive: unpack it"),
+        (b"%PDF-1.7", "is a PDF"),
+        (b"\0\0\0\x18ftypheic", "is a single picture"),
+        (b"ID3" + b"x" * 99, "is sound without a picture"),
+        (b"Thank you for your order. " * 9, "is a text file"),
+    ],
+)
+def test_what_is_no_video_is_named_before_anything_is_decoded(tmp_path, library, monkeypatch, content, words):
+    monkeypatch.setattr(demos, "decode", None)
+    (tmp_path / "x.mp4").write_bytes(content)
+    assert re.search(words, refused(tmp_path / "x.mp4", library))
+    with pytest.raises(UserError, match="is a folder: give one video file"):
+        import_video(tmp_path, name="x", demos_dir=library)

@@ -15,6 +15,7 @@ import pytest
 
 from onedemo.demos import sandboxed_decoder
 from onedemo.demos.decoder_child import shaped_frames
+from onedemo.demos.library import import_video
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
 from onedemo.errors import UserError
 from unit.demos.test_library import make_video, refused
@@ -161,3 +162,81 @@ def test_the_child_knows_nothing_of_its_parent(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "x")
     list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
     assert "SECRET" not in seen["env"] and seen.get("close_fds", True) and not seen.get("shell")
+
+
+def run_child_after(monkeypatch, code, **surroundings):
+    """The real child, but for what ``code`` changes before it begins."""
+    child = subprocess.Popen
+    start = f"import sys; {code}; from onedemo.demos import decoder_child; decoder_child._main(sys.argv[1])"
+
+    def popen(command, **how):
+        how["env"] = how["env"] | surroundings
+        return child([sys.executable, "-P", "-B", "-c", start, command[-1]], **how)
+
+    monkeypatch.setattr(sandboxed_decoder.subprocess, "Popen", popen)
+
+
+NO_ADDRESS_LIMIT = """import resource as r; real = r.setrlimit
+def setrlimit(what, limits):
+    if what == r.RLIMIT_AS: raise ValueError('current limit exceeds maximum limit')
+    real(what, limits)
+r.setrlimit = setrlimit"""
+
+
+def as_expression(code):
+    return f"exec({code!r})"
+
+
+def test_where_address_space_cannot_be_limited_memory_is_watched(tmp_path, monkeypatch):
+    """As on macOS, whose processes have more mapped than any such limit."""
+    run_child_after(monkeypatch, as_expression(NO_ADDRESS_LIMIT))
+    path = make_video(tmp_path / "a.avi", count=12)
+    assert len(list(decode(path, Options()))) == 12
+    with pytest.raises(UserError, match="needs more memory than a video may"):
+        list(decode(path, Options(), Limits(memory=40 << 20)))
+
+
+def test_without_limits_nothing_is_decoded(tmp_path, monkeypatch):
+    """As on Windows."""
+    monkeypatch.setattr(sandboxed_decoder.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match="on Windows: in WSL 2"):
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+
+
+def test_the_last_that_a_child_says_is_told_and_logged(tmp_path, monkeypatch, caplog):
+    run_child_after(monkeypatch, "raise ImportError('libpython3.11.so.1.0: cannot open shared object file')")
+    with pytest.raises(UserError, match=r"ended with: ImportError: libpython3.*; .*ffmpeg -i x -c:v libx264"):
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+    assert "ended with status 1: ImportError: libpython3" in caplog.text
+
+
+def test_a_child_that_complains_without_end_is_not_waited_for(tmp_path, monkeypatch):
+    run_child_after(monkeypatch, "[sys.stderr.write('x' * 9999 + chr(10)) for _ in range(99)]")
+    start = time.monotonic()
+    with pytest.raises(UserError):
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+    assert time.monotonic() - start < 20
+
+
+def test_the_place_of_shared_libraries_is_passed_on(tmp_path, monkeypatch):
+    monkeypatch.setenv("LD_LIBRARY_PATH", "/opt/python/lib")
+    run_child_after(monkeypatch, "import os; raise SystemExit(os.environ['LD_LIBRARY_PATH'])")
+    with pytest.raises(UserError, match="ended with: /opt/python/lib"):
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+
+
+def test_a_name_that_is_not_utf_8(tmp_path, library):
+    path = make_video(tmp_path / "a.avi", count=12)
+    odd = tmp_path / os.fsdecode(b"saut\xe9.avi")
+    path.rename(odd)
+    demo = import_video(odd, name="saut", demos_dir=library)
+    assert demo.frames == 12 and demo.source == "saut\N{REPLACEMENT CHARACTER}.avi"
+
+
+def test_the_child_can_open_no_file(tmp_path, monkeypatch):
+    """A decoder that has been taken over gets at nothing but the video: not even a name is opened."""
+    attack = "import onedemo.demos.decoder_child as d; "
+    attack += "d.check_size = lambda name, *_: name and open('/etc/passwd')"
+    run_child_after(monkeypatch, attack)
+    with pytest.raises(UserError, match=r"OSError: \[Errno 24\] Too many open files: '/etc/passwd'"):
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
