@@ -112,7 +112,7 @@ def test_a_package_is_small_and_says_what_it_is():
         _, *code = ast.parse(init.read_text()).body
         text = ast.get_docstring(ast.parse(init.read_text())) or ""
         assert 3 <= len([line for line in text.splitlines() if line]) <= 5, f"{init}: what is the package?"
-        # A name is imported from the module that defines it: one way to each, and none loads more than needed.
+        # A name is imported from the module that defines it: one way to each, and nothing else is loaded.
         assert not code or init.parent.name == "templates", f"{init} says what the package is and no more"
 
 
