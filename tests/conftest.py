@@ -110,7 +110,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
         again=Again(shared=0, repeated=0),
         guard_seconds=0.05,
-        live_fps=1.0,  # without a GPU each frame costs a tenth of a second
+        live_fps=2.0,  # without a GPU each frame costs a tenth of a second
     )
     front = Front(page, Listening(port=0))
     url = front.start()

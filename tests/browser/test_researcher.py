@@ -9,7 +9,7 @@ import math
 import pyarrow.parquet as pq
 import pytest
 
-from browser.test_page import DESKTOP, GUARD_MS, opened, until
+from browser.test_page import DESKTOP, GUARD_MS, SMALL, opened, until
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import SKIPS
 from onedemo.storage.ratings import SKIP_COLUMNS
@@ -38,7 +38,7 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site):
     rate_some(site)
     store, run = site.trainer.store, site.trainer.run
     bob = {rater.name: rater.id for rater in store.accounts.raters()}["Bob <i>"]
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-quality >> text=30 clips", timeout=20_000)
         page.wait_for_selector(".od-quality >> text=100 %")  # the second looks
@@ -74,7 +74,7 @@ def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_pa
     store.ratings.skip(ids[1], ann, 800)
     store.ratings.skip(ids[2], ann, 900)
     store.ratings.undo(ids[2], ann)
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Data")
         row = page.locator("tr", has_text="=Ann").first
         row.wait_for(timeout=20_000)
@@ -92,7 +92,7 @@ def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_pa
 
 def test_ratings_are_filtered_previewed_and_downloaded(chromium, site, tmp_path):
     ids = rate_some(site)
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Data")
         page.wait_for_selector(".od-filter")
         page.fill('.od-filter [name="rater"]', "Ann")
@@ -135,7 +135,7 @@ def test_parts_of_the_demo_and_the_best_rollouts(chromium, site):
             site.trainer.run, k, snapshot=k, env_steps=16000 * k,
             stats={"predicted": 2.0, "kl": 0.01, "best": 2.5 + k / 10, "timeline": timeline},
         )  # fmt: skip
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         page.wait_for_selector(".od-parts >> text=iteration 3; between 1.0 and 3.0; weakest at 5.7 s")
         assert (
             page.locator(".od-cells i").count() == 40 and page.locator(".od-cells [data-none]").count() == 4
@@ -160,7 +160,7 @@ def test_runs_side_by_side(chromium, site):
         for k in range(1, 6):
             stats = {"predicted": 2 + above + k / 10, "kl": 0.01, "true_reward": 100.0 * k}
             store.runs.add_iteration(run, k, snapshot=k, env_steps=16000 * k, stats=stats)
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-runs >> text=hop-1")
         row = page.locator(".od-runs tr", has_text="hop-1")
@@ -184,7 +184,7 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
             run=name, demo="hopper-hop", demo_sha256="0", seed=seed, config='method = "paper"\n', version="0"
         )
         store.runs.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
-    with opened(chromium, site.links["researcher"]) as page:
+    with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-which >> text=6 runs drawn.")
 

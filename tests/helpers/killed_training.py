@@ -78,7 +78,9 @@ def arm(moment: str) -> None:
 
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
-    config = small_world.small_config(method=method, ratings__rounds=4, predictor__appearance=False)
+    config = small_world.small_config(
+        method=method, ratings__rounds=4, predictor__appearance=False, predictor__members=1
+    )
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))
     with closing(Store(data_dir)) as store:

@@ -24,13 +24,14 @@ from pathlib import Path
 
 from load.annotators import browser_session, open_tab, rating
 from load.painted import CHROMIUM_FLAGS, find_chromium
-from load.serving import Server, annotator_link
+from load.serving import FEW_STATES, Server, annotator_link
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 
 SETTINGS = [
     "predictor.appearance=false", "ratings.pretrain=30", "ratings.online=1000000", "ratings.rounds=2",
     "ratings.stale_iterations=1000000", "rollouts.lanes=16", "rollouts.steps=100", "predictor.updates=100",
+    *FEW_STATES,
 ]  # fmt: skip
 """Small, so that refits, snapshots and checkpoints are written all the time."""
 START_S = 10.0

@@ -27,6 +27,8 @@ from onedemo.storage.clips import NewClip
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 
+FEW_STATES = ("practice.random_lanes=8", "practice.bank_tries=500", "ratings.queue=4")
+"""Settings of a run that is not to learn anything: it begins 5 s sooner, and draws fewer clips."""
 _PATIENCE_S = 900.0
 _IN_HAND = 2
 """Clips at each open page: one on screen, one fetched ahead."""
@@ -302,18 +304,21 @@ class Stocked:
 
 
 @asynccontextmanager
-async def stocked(data_dir: Path, *, presses: int, people: int) -> AsyncIterator[Stocked]:
+async def stocked(
+    data_dir: Path, *, presses: int, people: int, settings: Sequence[str] = ()
+) -> AsyncIterator[Stocked]:
     """A server that practises and need not draw: clips in stock are copies of a few.
 
     Args:
         data_dir: A new one, or one that was used.
         presses: How many there will be, about.
         people: How many there will be at once, at most.
+        settings: More ``section.key=value``.
     """
     # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
     settings = [
         "ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000",
-        "rollouts.total_steps=1000000000",
+        "rollouts.total_steps=1000000000", *settings,
     ]  # fmt: skip
     with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
         before = store.ratings.last_event()

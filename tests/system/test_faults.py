@@ -14,7 +14,7 @@ import pytest
 
 from helpers.paths import ROOT
 from helpers.small_world import falling_demo, small_config
-from load.serving import serving
+from load.serving import FEW_STATES, serving
 from onedemo.errors import UserError, in_words
 from onedemo.storage.store import Store
 from unit.training.test_trainer import make_trainer, rate_all, wait_for
@@ -161,7 +161,7 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
 
 
 def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium):
-    settings = ["predictor.appearance=false", "ratings.queue=4"]
+    settings = ["predictor.appearance=false", *FEW_STATES]
     with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
         (run,) = (row["id"] for row in store.runs.all())
         wait_for(lambda: len(store.clips.waiting(run)) == 4, 60)

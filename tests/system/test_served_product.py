@@ -12,9 +12,11 @@ import pytest
 from helpers import beside_playwright
 from load import crowd, painted, product
 from load.annotators import Press, browser_session, open_tab
-from load.serving import Server, check_counts, give, stocked
+from load.serving import FEW_STATES, Server, check_counts, give, stocked
 
 pytestmark = pytest.mark.seam
+
+QUICK = (*FEW_STATES, "rollouts.lanes=16")
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +31,10 @@ def test_presses_are_timed_until_the_next_clip_is_there_and_painted(data_dir, ch
     """One server for all of it. Raises if a press is lost or doubled."""
 
     async def all_of_it():
-        async with stocked(data_dir, presses=80, people=5) as study:
+        async with stocked(data_dir, presses=80, people=5, settings=QUICK) as study:
             return (
                 await product.press_times(study, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}),
-                await crowd.crowd(study, people=5, every_s=1.0, seconds=5.0),
+                await crowd.crowd(study, people=5, every_s=0.5, seconds=2.0),
                 await painted.press_to_paint(study, turns=1, presses=4),
             )
 

@@ -4,6 +4,7 @@ import ast
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,12 +35,15 @@ PLACE = {name: number for number, name in enumerate(" ".join(ORDER).split())}
 MOST_MODULES = 14
 
 
+@cache
 def modules():
     """(dotted name, file) of every module."""
+    found = []
     for folder, name in (("trainer", "onedemo"), ("app", "onedemo.app")):
         for file in sorted((ROOT / folder).rglob("*.py")):
             parts = file.relative_to(ROOT / folder).with_suffix("").parts
-            yield ".".join([name, *parts]).removesuffix(".__init__"), file
+            found.append((".".join([name, *parts]).removesuffix(".__init__"), file))
+    return found
 
 
 def package(module):
@@ -105,7 +109,11 @@ def test_a_package_is_small_and_says_what_it_is():
     for init in [*ROOT.glob("trainer/**/__init__.py"), *ROOT.glob("app/**/__init__.py")]:
         others = [file for file in init.parent.glob("*.py") if not file.name.startswith("__")]
         assert len(others) <= MOST_MODULES, f"{init.parent} has {len(others)} modules"
-        assert ast.get_docstring(ast.parse(init.read_text())), f"{init} does not say what the package is"
+        _, *code = ast.parse(init.read_text()).body
+        text = ast.get_docstring(ast.parse(init.read_text())) or ""
+        assert 3 <= len([line for line in text.splitlines() if line]) <= 5, f"{init}: what is the package?"
+        # A name is imported from the module that defines it: one way to each, and nothing else is loaded.
+        assert not code or init.parent.name == "templates", f"{init} says what the package is and no more"
 
 
 def test_every_package_is_installed():

@@ -1,4 +1,5 @@
-"""Simulated annotators and their errors.
+"""Simulated annotators and their errors, by name: ``oracle.make_rater``.
 
-They may read a demo's ground truth; nothing that learns may import them.
+The oracle and the script measure a demo's hidden states, ``custom`` loads a rater of the user's own, and
+``noise`` makes any of them err. Nothing that learns may import them.
 """

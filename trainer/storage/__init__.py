@@ -1,4 +1,5 @@
-"""The SQLite database: schema, events, accounts, audit log.
+"""The SQLite database of a data directory: ratings and all other events, clips, runs, accounts, audit log.
 
-One connection, one lock; every write is one transaction.
+``Store`` opens it and is composed of the rest. One connection, one lock; every write is one transaction.
+``run_directory`` knows the files of a run beside the database, ``schema`` the steps between versions.
 """

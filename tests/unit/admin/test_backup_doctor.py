@@ -20,7 +20,7 @@ from PIL import Image
 from helpers import beside_playwright
 from helpers.small_world import falling_demo, small_config
 from load.annotators import browser_session, open_tab, rating
-from load.serving import reach, serving
+from load.serving import FEW_STATES, reach, serving
 from onedemo.app.admin.backup import back_up
 from onedemo.app.admin.restore import restore
 from onedemo.app.cli.main import main
@@ -322,7 +322,7 @@ def test_a_server_goes_on_from_a_backup_of_a_running_one(tmp_path, looked):
         ]
         subprocess.run(command, check=True, capture_output=True)
 
-    with serving(data_dir, ["ratings.pretrain=100"]) as server:
+    with serving(data_dir, ["ratings.pretrain=100", *FEW_STATES]) as server:
         pressed = beside_playwright.run(rate(server.links["annotator"], 12, save))
         links = server.links
     restore(file, again)

@@ -11,6 +11,7 @@ import pytest
 
 from helpers.paths import ROOT
 from helpers.server_process import Serving
+from load.serving import FEW_STATES
 from onedemo.app.cli.main import _app, main
 from onedemo.config import METHODS, RunConfig, describe, to_toml
 from onedemo.storage.database import FILE_NAME
@@ -181,7 +182,8 @@ def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(servin
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    child, links, _ = serving.start("--port", str(port))
+    quick = [word for setting in FEW_STATES for word in ("--set", setting)]
+    child, links, _ = serving.start("--port", str(port), *quick)
     assert list(links) == ["researcher", "annotator"]
     assert all(link.startswith(f"http://127.0.0.1:{port}/login?token=") for link in links.values())
     second, none, log = serving.start("--port", str(port))
