@@ -42,6 +42,7 @@ _COMMANDS = {
     "run:train": "The same trainer without a browser, rated by a program.",
     "demos:demo": "Bring in and look at demonstration videos.",
     "people:rater": "People and their links.",
+    "proxy:proxy": "Lines for nginx or Caddy before the server.",
     "people:audit": "Who signed in, took data out or changed a run.",
     "data:export": "The ratings as CSV, what was rated as Parquet.",
     "data:import_": "An export back into an empty data directory.",

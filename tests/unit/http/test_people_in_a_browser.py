@@ -13,12 +13,15 @@ import pytest
 from yarl import URL
 
 from helpers.beside_playwright import run
+from helpers.paths import ROOT
 from onedemo.app.annotation.presses import PageGone
+from onedemo.app.cli.main import main
 from onedemo.app.http import assets, viser_proxy
 from onedemo.app.http.auth import PAGE_HEADER
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front
-from onedemo.app.http.tokens import issue_link, passing_link, read_secret
+from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, write_address
+from onedemo.errors import UserError
 from onedemo.storage.accounts import MOST_SESSIONS
 from onedemo.storage.database import now
 from onedemo.storage.store import Store
@@ -303,10 +306,8 @@ def test_nothing_inline_runs_but_viser_s_two_scripts(store):
     assert inline == [assets.viser_scripts()[0]]
     assert policy["script-src"].count("'sha256-") == 2
     for answer in others:
-        assert (
-            answer.headers["Content-Security-Policy"] == assets.POLICY
-            and "script-src 's" not in assets.POLICY
-        )
+        assert answer.headers["Content-Security-Policy"] == assets.POLICY
+    assert "script-src 's" not in assets.POLICY
 
 
 def test_what_changes_something_is_done_from_an_open_page_alone(store):
@@ -323,9 +324,11 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
                     await one.post(path, page=""),
                     await one.post(path, page="another"),
                     await one.get(path, method="POST"),
-                    await one.get(path, method="POST", Origin="http://o.example", **{PAGE_HEADER: "open"}),
-                    await one.get(path, method="POST", Origin="null", **{PAGE_HEADER: "open"}),
-                ]  # fmt: skip
+                    *[
+                        await one.get(path, method="POST", Origin=origin, **{PAGE_HEADER: "open"})
+                        for origin in ("http://elsewhere.example", "null")
+                    ],
+                ]
                 assert {answer.status for answer in refused} <= {400, 403, 409}, path
             press = {"press": "skip", "clip": 1, "id": "a", "page": "another"}
             assert (await one.post("/r/1/press", body=press)).status == 409
@@ -421,3 +424,46 @@ def test_the_audit_log_cannot_be_flooded(store):
     assert ("other addresses", "sign-in refused", "in other ways, 39 more in ten minutes") in told
     with closing(sqlite3.connect(store.path)) as db:
         assert db.execute("SELECT COUNT(*) FROM tokens WHERE kind = 'session'").fetchone()[0] == 50
+
+
+def test_links_of_another_process_carry_the_server_s_address(store, capsys):
+    directory = store.path.parent
+    where = ["--data-dir", str(directory)]
+    assert read_address(directory) == "http://127.0.0.1:8080"
+    write_address(directory, "https://study.example.org/study1")
+    assert main(["rater", "add", "Ann", *where]) == 0
+    assert capsys.readouterr().out.startswith("https://study.example.org/study1/login?token=")
+    assert main(["rater", "add", "Ann", "--once", "--url", "http://x:1", *where]) == 0
+    assert capsys.readouterr().out.startswith("http://x:1/login?token=")
+
+
+@pytest.mark.parametrize(
+    ("options", "address"),
+    [
+        ({}, "http://127.0.0.1:8081"),
+        ({"base_path": "/study1"}, "http://127.0.0.1:8081/study1"),
+        ({"host": "::1"}, "http://[::1]:8081"),
+        ({"host": "0.0.0.0", "tls_cert": "c", "tls_key": "k"}, "https://127.0.0.1:8081"),
+        ({"tls_cert": "c", "tls_key": "k", "names": ("a.example.org", "b")}, "https://a.example.org:8081"),
+        ({"behind_proxy": True}, "http://127.0.0.1:8081"),
+        ({"behind_proxy": True, "names": ("a.org",), "base_path": "/b/c"}, "https://a.org/b/c"),
+    ],
+)
+def test_the_address_that_links_carry(options, address):
+    assert Listening(**options).address(8081) == address
+
+
+@pytest.mark.parametrize("path", ["study1", "/study1/", "//", "/a b", "/../x", "/ä", "/" + "x" * 100, "/a?b"])
+def test_a_base_path_is_a_plain_path(path):
+    with pytest.raises(UserError, match="--base-path takes a path such as /study1"):
+        Listening(base_path=path)
+
+
+def test_no_script_of_ours_makes_markup_of_text():
+    scripts, templates = [*ROOT.glob("static/*.js")], [*ROOT.glob("app/templates/*.html")]
+    assert len(scripts) >= 2 and len(templates) >= 10
+    for path in scripts:
+        makes = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|Function\("
+        assert not re.search(makes, path.read_text()), path
+    for path in templates:
+        assert not re.search(r"\|\s*safe\b|autoescape|\son[a-z]+=|javascript:", path.read_text()), path
