@@ -15,7 +15,6 @@ import logging
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from onedemo import static
+from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_name
 from onedemo.demos.frame_clock import steps_of_frames
@@ -98,11 +98,11 @@ def import_video(
     if name in {demo.name for demo, _ in stored}:
         raise UserError(f"the name {name} is taken by another demo; choose another --name")
     try:
-        demos_dir.mkdir(parents=True, exist_ok=True)
-        workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        make_directory(demos_dir, private=True)
+        place = Workshop(demos_dir, ".import-")
+        workshop = place.path
     except OSError as error:
         raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
-    workshop.chmod(0o755)  # made for this user alone, but others may read demos
     try:
         video = workshop / "video.webm"
         with closing(decode(path, options, limits)) as frames:
@@ -126,6 +126,7 @@ def import_video(
                 return demo
         shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
         os.replace(workshop, final)
+        sync_directory(demos_dir)
     except BaseException:
         shutil.rmtree(workshop, ignore_errors=True)
         raise
@@ -267,6 +268,7 @@ def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
     with VideoReader(video) as reader:
         about |= {"width": reader.info.width, "height": reader.info.height}
     write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
+    video.chmod(path.stat().st_mode & 0o777)  # OpenCV lets everybody read it
     return about
 
 
