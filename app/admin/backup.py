@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from onedemo.app.admin.archive import FORMAT, MANIFEST, is_saved
-from onedemo.core.directories import sync_directory, workshop
+from onedemo.core.directories import Workshop, sync_directory
 from onedemo.errors import UserError
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.schema import check_schema
 
 _BLOCK = 1 << 20
 _OURS = re.compile(
-    rf"(.*/)?(lock|address|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
+    rf"(.*/)?(address|lock|.*\.lock|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
 )
 """What onedemo writes into a data directory and nobody would miss in a backup."""
 _SNAPSHOT = re.compile(r"runs/([^/]+)/snapshots/(\d+)\.pt")
@@ -62,7 +62,7 @@ def back_up(data_dir: Path, file: Path) -> Saved:
         checkpoints = {
             path: stack.enter_context(path.open("rb")) for path in data_dir.glob("runs/*/checkpoint.pt")
         }
-        place = stack.enter_context(workshop(file.absolute().parent, f".{file.name}."))
+        place = stack.enter_context(Workshop(file.absolute().parent, f".{file.name}."))
         ratings, snapshots = _copy_database(data_dir / FILE_NAME, place / FILE_NAME)
         half, left_out = place / "archive", []
         with half.open("wb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:

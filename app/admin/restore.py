@@ -12,7 +12,7 @@ from pathlib import Path
 
 from onedemo.app.admin.archive import read_manifest
 from onedemo.app.admin.inspection import check_contents, opened_as_it_is
-from onedemo.core.directories import make_directory, sync_directory, workshop
+from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import copy_synced
 from onedemo.errors import UserError
 from onedemo.storage.database import FILE_NAME
@@ -51,7 +51,7 @@ def restore(file: Path, data_dir: Path) -> dict[str, int]:
             digests = read_manifest(archive, file)
             _check_room(file, place)
             make_directory(place)
-            with workshop(place, f".{data_dir.name}.") as half:
+            with Workshop(place, f".{data_dir.name}.") as half:
                 return _restore(archive, file, digests, half, data_dir.absolute())
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise UserError(f"{file} is damaged, or no backup: {error}") from None

@@ -9,12 +9,14 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import io
 import os
 import secrets
 from datetime import timedelta
 from pathlib import Path
 
-from onedemo.core.files import write_atomic
+from onedemo.core.directories import locked, make_directory, sync_directory
+from onedemo.core.files import copy_synced, write_atomic
 from onedemo.errors import UserError
 from onedemo.storage.store import Store
 from onedemo.types import Rater
@@ -134,19 +136,13 @@ def read_span(text: str) -> timedelta:
 
 
 def _create(path: Path) -> None:
-    # Written beside its place and linked into it: a reader never sees half a secret, and of two
-    # processes that start at once the first one's secret is kept.
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
-    descriptor = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(secrets.token_bytes(SECRET_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-        try:
-            os.link(draft, path)
-        except FileExistsError:
-            pass
-    finally:
-        draft.unlink()
+    # Written beside its place and renamed, one process at a time: a reader never sees half a secret, and of
+    # two processes that start at once the first one's secret is kept. Hard links are not everywhere.
+    make_directory(path.parent, private=True)
+    with locked(path.parent):
+        if path.exists():
+            return
+        draft = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}")
+        copy_synced(io.BytesIO(secrets.token_bytes(SECRET_BYTES)), draft)
+        os.replace(draft, path)
+        sync_directory(path.parent)

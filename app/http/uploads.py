@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import os
-import tempfile
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -18,6 +16,8 @@ from typing import Any
 
 from aiohttp import BodyPartReader, web
 
+from onedemo.core.directories import Workshop, clear_left_over, make_directory
+from onedemo.core.files import private_opener
 from onedemo.demos.import_checks import read_crop
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
@@ -45,8 +45,8 @@ class Uploads:
         self._demos_dir, self._place = data_dir / "demos", data_dir / "uploads"
         self._largest, self._longest = largest, longest
         self._open = 0
-        for left in self._place.glob("upload-*"):
-            left.unlink(missing_ok=True)
+        clear_left_over(self._place, "upload-")  # not of another server, which may be at it
+        clear_left_over(self._demos_dir, ".import-")
 
     async def add(self, request: web.Request) -> web.Response:
         """Answers a form with ``name``, if wanted ``start``, ``end``, ``crop``, ``mirror``, last ``video``.
@@ -58,15 +58,14 @@ class Uploads:
         self._open += 1
         path = None
         try:
-            self._place.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=self._place, prefix="upload-")
-            path = Path(name)
-            with os.fdopen(handle, "wb") as file:
-                async with asyncio.timeout(self._longest):
-                    fields = await self._receive(request, file)
-            demo = await asyncio.to_thread(
-                partial(import_video, path, demos_dir=self._demos_dir, source="uploaded", **_options(fields))
-            )
+            make_directory(self._place, private=True)
+            with Workshop(self._place, "upload-") as place:
+                path = place / "video"
+                with open(path, "xb", opener=private_opener) as file:
+                    async with asyncio.timeout(self._longest):
+                        fields = await self._receive(request, file)
+                options = {"demos_dir": self._demos_dir, "source": "uploaded"} | _options(fields)
+                demo = await asyncio.to_thread(partial(import_video, path, **options))
         except TimeoutError:
             raise web.HTTPRequestTimeout(
                 text=f"The video did not arrive within {self._longest:g} s; send a shorter one."

@@ -144,6 +144,7 @@ class Study:
 @contextmanager
 def _log_to(file: Path) -> Iterator[None]:
     """Writes the log into a file for as long as the block lasts."""
+    file.touch(mode=0o600)
     handler = logging.FileHandler(file)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     handler.addFilter(LogLimit())

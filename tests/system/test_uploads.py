@@ -13,6 +13,7 @@ from onedemo.app.http.auth import PAGE_HEADER, AccessControl, Route
 from onedemo.app.http.bind import Listening
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.http.uploads import Uploads
+from onedemo.core.directories import Workshop
 from onedemo.demos.library import find_demo, read_frames
 from onedemo.storage.store import Store
 from unit.demos.test_library import make_video
@@ -188,3 +189,12 @@ def test_what_a_killed_server_left_is_removed(tmp_path):
     (tmp_path / "uploads" / "upload-x").write_bytes(b"x")
     Uploads(tmp_path)
     assert list((tmp_path / "uploads").iterdir()) == []
+
+
+def test_a_second_server_leaves_the_uploads_of_the_first_alone(tmp_path):
+    (tmp_path / "uploads").mkdir()
+    (tmp_path / "demos").mkdir()
+    with Workshop(tmp_path / "uploads", "upload-") as one, Workshop(tmp_path / "demos", ".import-") as two:
+        (one / "video").write_bytes(b"on its way")
+        Uploads(tmp_path)
+        assert (one / "video").read_bytes() == b"on its way" and two.exists()

@@ -6,6 +6,7 @@ import fcntl
 import os
 import shutil
 import tempfile
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -38,25 +39,41 @@ def sync_directory(path: Path) -> None:
 
 
 @contextmanager
-def workshop(place: Path, prefix: str) -> Iterator[Path]:
+def locked(path: Path) -> Iterator[None]:
+    """One process or thread at a time in a directory, which others wait for; where locks are, that is."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+class Workshop:
     """A hidden directory to prepare something in, which is gone afterwards unless it was renamed.
 
-    It is locked while this process lives. What others have left that were killed is removed first.
+    "Afterwards" is the end of the ``with`` block or of this object. It is locked while this process lives;
+    what others have left that were killed is removed first.
 
     Args:
         place: Where; on the file system that the result is renamed into.
-        prefix: Of its name, which begins with a dot and goes on at random.
+        prefix: Of its name, which goes on at random.
 
     Raises:
         OSError: If it cannot be made.
     """
-    clear_left_over(place, prefix)
-    path, handle = _made_and_locked(place, prefix)
-    try:
-        yield path
-    finally:
-        shutil.rmtree(path, ignore_errors=True)
-        os.close(handle)
+
+    def __init__(self, place: Path, prefix: str) -> None:
+        clear_left_over(place, prefix)
+        self.path, handle = _made_and_locked(place, prefix)
+        self._end = weakref.finalize(self, _end, self.path, handle)
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *_: object) -> None:
+        self._end()
 
 
 def clear_left_over(place: Path, prefix: str) -> None:
@@ -87,3 +104,8 @@ def _made_and_locked(place: Path, prefix: str) -> tuple[Path, int]:
             os.close(handle)
             raise
         os.close(handle)  # somebody cleared it away before it was locked
+
+
+def _end(path: Path, handle: int) -> None:
+    shutil.rmtree(path, ignore_errors=True)
+    os.close(handle)

@@ -16,11 +16,16 @@ from pathlib import Path
 from typing import IO
 
 from onedemo.core.directories import make_directory, sync_directory
+from onedemo.core.shared_disks import heartbeat, is_shared, refuse_if_elsewhere
 from onedemo.errors import UserError
 
 log = logging.getLogger("onedemo")
 
 _BLOCK = 1 << 20
+ON_SHARED = (
+    "{} is on a network file system: only one computer at a time may use it, and a power cut may cost what "
+    "was rated last; a disk of this computer is the place for a data directory"
+)
 
 
 def write_atomic(path: Path, data: bytes | Iterable[bytes], *, sync: bool = True) -> None:
@@ -157,22 +162,31 @@ _SEAL = b"onedemo crc32 %08x"
 def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Holds a lock file: one process at a time, released when it ends, however it ends.
 
+    On a file system that other computers share, who holds it also says so in it (``shared_disks``).
+
     Args:
         path: The file; made if missing, and left there.
         wait: For another process to let go of it.
 
     Raises:
-        UserError: If another process holds it, and this one does not wait.
+        UserError: If another process holds it, here or on another computer, and this one does not wait.
     """
     make_directory(path.parent)
-    with open(path, "w", opener=private_opener) as file:
+    with open(path, "ab", opener=private_opener) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             raise UserError(
                 f"another onedemo is working on {path.parent}; stop it, or choose another --run or --data-dir"
             ) from None
-        yield
+        if not is_shared(path):
+            yield
+            return
+        if not wait:
+            refuse_if_elsewhere(path)
+            log.warning("%s", ON_SHARED.format(path.parent))
+        with heartbeat(path):
+            yield
 
 
 @cache

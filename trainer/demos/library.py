@@ -18,7 +18,6 @@ import logging
 import math
 import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
@@ -28,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from onedemo import static
+from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import hold, write_atomic
 from onedemo.core.names import check_name
 from onedemo.demos.containers import check_file
@@ -102,12 +102,11 @@ def import_video(
             return demo
     _check_free(name, (demo for demo, _ in stored))
     try:
-        demos_dir.mkdir(parents=True, exist_ok=True)
-        workshop = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
+        make_directory(demos_dir, private=True)
+        place = Workshop(demos_dir, ".import-")
     except OSError as error:
         raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
-    workshop.chmod(0o755)  # made for this user alone, but others may read demos
-    try:
+    with place as workshop:
         video = workshop / "video.webm"
         check, pictures = StoredCheck(), hashlib.sha256(f"{fps:g}".encode())
         with closing(decode(path, options, limits)) as frames:
@@ -129,8 +128,6 @@ def import_video(
             **origin,
         )
         return _keep(workshop, about, demos_dir)
-    finally:
-        shutil.rmtree(workshop, ignore_errors=True)
 
 
 def remove_demo(demo: Demo, demos_dir: Path) -> None:
@@ -140,13 +137,12 @@ def remove_demo(demo: Demo, demos_dir: Path) -> None:
         UserError: If it came with the program, or cannot be deleted.
     """
     directory = _own_directory(demo, demos_dir)
-    away = Path(tempfile.mkdtemp(dir=demos_dir, prefix=".import-"))
     try:
-        os.replace(directory, away / "gone")  # at once: half a demo would be a damaged one
+        with Workshop(demos_dir, ".import-") as away:
+            os.replace(directory, away / "gone")  # at once: half a demo would be a damaged one
+            sync_directory(demos_dir)
     except OSError as error:
         raise UserError(f"cannot delete {directory}: {error.strerror}") from error
-    finally:
-        shutil.rmtree(away, ignore_errors=True)
 
 
 def rename_demo(demo: Demo, name: str, demos_dir: Path) -> Demo:
@@ -326,6 +322,7 @@ def _keep(workshop: Path, about: dict[str, Any], demos_dir: Path) -> Demo:
         final = demos_dir / about["sha256"]
         shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
         os.replace(workshop, final)
+        sync_directory(demos_dir)
     return _demo(about, final / _VIDEO)
 
 
@@ -352,6 +349,7 @@ def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
     with VideoReader(video) as reader:
         about |= {"width": reader.width, "height": reader.height}
     write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
+    video.chmod(path.stat().st_mode & 0o777)  # OpenCV lets everybody read it
     return about
 
 

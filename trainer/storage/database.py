@@ -20,6 +20,7 @@ from pathlib import Path
 
 from onedemo.core.directories import make_directory
 from onedemo.core.files import private_opener
+from onedemo.core.shared_disks import is_shared, refuse_if_elsewhere
 from onedemo.errors import DatabaseLost, UserError
 from onedemo.storage.schema import check_version, migrate
 
@@ -51,6 +52,9 @@ class Database:
         self._closed, self._watch = threading.Event(), None
         try:
             make_directory(self.path.parent, private=True)
+            if is_shared(self.path.parent):
+                for lock in self.path.parent.glob("runs/*/lock"):
+                    refuse_if_elsewhere(lock)
             if not self.path.exists():
                 self._check_new()
                 open(self.path, "ab", opener=private_opener).close()  # SQLite would let others read it

@@ -15,7 +15,7 @@ from helpers.hostile_archives import HOSTILE, good_backup, hot_journal, make, sm
 from onedemo.app.admin.archive import MANIFEST
 from onedemo.app.admin.backup import back_up
 from onedemo.app.admin.restore import restore
-from onedemo.core.directories import workshop
+from onedemo.core.directories import Workshop
 from onedemo.errors import UserError
 from onedemo.storage.database import FILE_NAME
 from onedemo.types import Segment
@@ -56,7 +56,7 @@ def test_the_journal_of_the_attack_is_a_real_one(good, tmp_path):
 
 
 def test_a_good_one_is_there_afterwards_for_its_owner_alone(good, tmp_path):
-    with workshop(tmp_path, ".again.") as half:  # of somebody who is still at work
+    with Workshop(tmp_path, ".again.") as half:  # of somebody who is still at work
         shutil.copytree(half, tmp_path / ".again.killed")  # of somebody who is not
         assert restore(good, tmp_path / "again") == {"files": 3, "ratings": 1}
         assert half.exists() and not (tmp_path / ".again.killed").exists()
