@@ -1,4 +1,4 @@
-"""Cookies, sessions and addresses of the front, without Viser and trainer behind it or a browser before it."""
+"""Cookies, sessions and addresses of the front: no Viser and trainer behind it, no browser before it."""
 
 from __future__ import annotations
 
