@@ -202,6 +202,13 @@ class AccessControl:
         return None
 
     async def _refuse(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
+        if link is not None and link.state in ("used", "expired") and request.method == "GET":
+            # Clicked again in the browser that it let in? The person's own cookie is sent below /r/N alone.
+            page = self._listening.page_path(link.rater.id)
+            if "rater" not in request.match_info:
+                raise web.HTTPSeeOther(f"{page}login?{request.query_string}")
+            if await self._session_of(request, link) is not None:
+                raise web.HTTPSeeOther(page)
         if not self.offences[self._listening.sender(request)].take():  # of links that open, none is refused
             return self._login_page(429, _REFUSED["too many"])
         address = self._listening.client(request)
@@ -211,13 +218,6 @@ class AccessControl:
         )
         if link is None:
             return self._login_page(403, _REFUSED["unknown"])
-        if link.state in ("used", "expired") and request.method == "GET":
-            # Clicked again in the browser that it let in? The person's own cookie is sent below /r/N alone.
-            if "rater" not in request.match_info:
-                page = self._listening.page_path(link.rater.id)
-                raise web.HTTPSeeOther(f"{page}login?{request.query_string}")
-            if await self._session_of(request, link) is not None:
-                raise web.HTTPSeeOther(self._listening.page_path(link.rater.id))
         # Read anew: of two who press at once, one finds it used.
         now = await asyncio.to_thread(self._store.accounts.link, hash_token(token))
         assert now is not None

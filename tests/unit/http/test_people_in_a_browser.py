@@ -1,4 +1,4 @@
-"""Cookies, sessions and pages of the front, without Viser and trainer: sockets and SQLite, no browser."""
+"""Cookies, sessions and addresses of the front: no Viser and trainer behind it, no browser before it."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ ESCAPED = "&lt;img src=x onerror=alert(1)&gt; &amp; &#34;&#39;"
 
 
 def test_a_value_is_escaped_in_text_and_in_attributes():
-    page = render("login.html", note=HOSTILE, token=HOSTILE, days=30)
+    page = render("login.html", base="", note=HOSTILE, token=HOSTILE, days=30)
     assert f'<p class="note" role="alert">{ESCAPED}</p>' in page and f'value="{ESCAPED}"' in page
     assert HOSTILE not in page and "<img src=x" not in page
 
@@ -29,7 +29,7 @@ def test_markup_of_another_template_is_escaped_once():
 
 def test_a_missing_value_is_an_error():
     with pytest.raises(UndefinedError, match="days"):
-        render("login.html", note="", token="abc")
+        render("login.html", base="", note="", token="abc")
     with pytest.raises(UndefinedError, match="source"):
         render("watch.html:frame")
     with pytest.raises(TypeError, match="sauce"):
