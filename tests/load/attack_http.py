@@ -172,7 +172,7 @@ async def under(kind: str, site: Site, connections: int, seconds: float, given: 
         try:
             tab = await open_tab(session, link_of(site, "bo"))
             stack.push_async_callback(tab.close)
-            await tab.until(lambda: tab.clip, "a clip", _PATIENCE_S)
+            await tab.until(lambda: tab.clip, "a clip", 5 * _PATIENCE_S)  # of all, the first has to be drawn
             if kind:
                 guest = await open_tab(session, link_of(site, "mallory"))
                 await guest.close()

@@ -21,7 +21,11 @@ ADDRESSES = 40
 _AGAIN_S = 1.0
 """How soon a connection that was ended is opened anew."""
 _HOST = "Host: 127.0.0.1\r\n"
-_FORM = "POST /login HTTP/1.1\r\n" + _HOST + "Content-Type: application/x-www-form-urlencoded"
+_FORM = (
+    "POST /login HTTP/1.1\r\nOrigin: http://127.0.0.1\r\n"
+    + _HOST
+    + "Content-Type: application/x-www-form-urlencoded"
+)
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ async def slow_bodies(aim: Aim) -> None:
 
 async def compressed(aim: Aim) -> None:
     """Small login bodies that become 60 kB, in a character set that is slow to read."""
-    body = zlib.compress(b"token=" + b"a" * 60_000, 9)
+    body = zlib.compress(b"b" * 60_000, 9)
     head = f"{_FORM}; charset=punycode\r\nContent-Encoding: deflate\r\nContent-Length: {len(body)}\r\n\r\n"
 
     async def once(number: int) -> None:

@@ -24,6 +24,7 @@ import sys
 import tempfile
 import threading
 import time
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, redirect_stderr
 from pathlib import Path
@@ -67,6 +68,18 @@ class Findings:
 
     def fail(self, what: str, data: bytes = b"") -> None:
         self.broken.append(f"{what}{': ' + data[:400].hex() if data else ''}")
+
+
+class Tracebacks(logging.Handler):
+    """Whatever ends in a traceback in the log is a promise broken."""
+
+    def __init__(self, findings: Findings) -> None:
+        super().__init__()
+        self._findings = findings
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info and record.exc_info[1] is not None:
+            self._findings.fail(f"{record.name} logged {record.exc_info[1]!r}: {record.getMessage()[:200]}")
 
 
 @contextmanager
@@ -223,41 +236,75 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
     return bytes(out)
 
 
-def hostile_request(rng: random.Random, cookie: str) -> bytes:
-    """One HTTP request, from an annotator or a stranger, whole or broken."""
+def hostile_request(rng: random.Random, cookie: str, own: str = "") -> bytes:
+    """One HTTP request, from an annotator or a stranger, whole or broken; ``own`` is the front's origin."""
     paths = (
         "/", "/login?token=x", "/login", "/healthz", "/r/2", "/r/1", "/r/2/press", "/r/1/do", "/r/2/do",
         "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg", "/rollouts/1.webm", "/export.csv", "/preview",
         "/segments.parquet", "/card.md", "/static/page.css", "/static/..%2f..%2fpyproject.toml",
         "/clips/%00.jpg", "/clips/99999999999999999999.jpg", "/demos", "//", "/r/000000002", "*", "http://x/",
+        f"/static/{'a' * 300}.css", "/static/%ed%a0%80.js", "/preview?value=%C2%B2", "/skips.csv?run=%C2%B2",
+        f"/preview?value={'9' * 30}", f"/card.md?run={'%F0%9F%98%80' * 80}", "/preview?" + "run=&" * 2000,
+        f"/rollouts/{'9' * 9}.jpg", "/login?token=%ff%fe", "/login?token=" + "a" * 8000, "/r/%D9%A2",
     )  # fmt: skip
     methods = ("GET", "POST", "PUT", "DELETE", "HEAD", "OPTIONS", "TRACE", "CONNECT", "PATCH", "G\0T", "")
     bodies = (
         b"", b"{}", b"[" * 3000, b'{"press": "rate", "clip": 1e999}',
         b'{"press": "rate", "page": "x", "id": "1", "clip": 1, "value": 3, "mark": [0, 1]}', b"\xff\xfe",
-        b'{"do": "exclude", "rater": 2}', b'{"do": "new run"}', b"x" * 70_000,
+        b'{"do": "exclude", "rater": 2}', b'{"do": "new run"}', b"x" * 70_000, b'{"a":' * 3000, b"9" * 6000,
+        b'{"do": "exclude", "rater": %d}' % 2**70, b'{"do": "open run", "run": "%s"}' % (b"\xc3\xa9" * 90),
+        b'{"do": "new run", "demo": "", "method": "", "name": "", "predictor_from": "", "seed": %d}' % 2**70,
+        b'{"press": "rate", "page": "x", "id": "1", "value": 3, "clip": %d}' % 2**70,
+        zlib.compress(b"token=" + bytes(1 << 20)), b"token=%ff%fe&token=" + b"%00" * 200, b"&" * 1000,
+        b"--b\r\n" + b"X: y\r\n" * 3000 + b"\r\n", b"--b\r\n\r\n--b--\r\n", b"--b\r\nX\r\n\r\n",
+        b'--b\r\nContent-Disposition: form-data; name="name"\r\n\r\n1\r\n' * 500,
+        b'--b\r\nContent-Disposition: form-data; name="video"; filename*=x\'\'%ff\r\n\r\n1\r\n--b--\r\n',
+        b"--b\r\nContent-Type: multipart/mixed; boundary=c\r\n\r\n--c\r\n\r\n--c--\r\n--b--\r\n",
     )  # fmt: skip
-    path = rng.choice(paths)
-    if rng.random() < 0.3:
-        path += rng.choice(("?", "/", "%", "%2e%2e/", "?run=", "\t", "\u00e9")) + "A" * rng.choice(
-            (0, 3, 9000)
-        )
+    codings = ("gzip", "deflate", "br", "zstd", "no-such", "", "gzip, gzip", "identity")
+    charsets = ("utf-8", "punycode", "utf-7", "idna", "no-such", "\0", "undefined", "zlib", "utf-16", '"')
+    kinds = (
+        "application/json", "application/x-www-form-urlencoded", "multipart/form-data; boundary=b",
+        "multipart/form-data", "multipart/form-data; boundary=" + "b" * 100, "a", "\xff",
+        "text/plain; charset",
+    )  # fmt: skip
+    protocols = ("viser-v1.1.1", "{", "a b", "\xe9", ",,", "x" * 500, "viser-v" + "9" * 300, "\x7f")
+    extras = (
+        "Origin: http://evil.example", "Upgrade: websocket", "Transfer-Encoding: chunked", "X\0: y",
+        ": empty", "Transfer-Encoding: gzip, chunked", "X-Onedemo-Rater: 1", "Range: bytes=-1", "If-Range: \xff",
+        f"Range: bytes={'9' * 5000}-", "Expect: 100-continue", "Expect: \xff", "X-Forwarded-For: \xff",
+        "If-None-Match: \xff", "If-Modified-Since: Mon, 99 Jan 99999 99:99:99 GMT",
+        "Cookie: " + "a=b; " * 999, "Cookie: \xff=\xfe; onedemo-1-=\0", *["X: y"] * 3,
+    )  # fmt: skip
+    # Most have one thing wrong, and get as far as that; the others have many.
+    odd = rng.choice((0.02, 0.02, 0.3))
+
+    def one(fine: str, wrong: tuple) -> str:
+        return rng.choice(wrong) if rng.random() < odd else fine
+
+    more = one("", ("?", "/", "%", "%2e%2e/", "?run=", "\t", "\u00e9")) + one("", ("A", "AAA", "A" * 9000))
     body = rng.choice(bodies) if rng.random() < 0.5 else b""
-    method = rng.choice(methods) if rng.random() < 0.5 else "GET"
+    method = one("POST" if body else "GET", methods)
     lines = [
-        f"{method} {path} HTTP/{rng.choice(('1.1', '1.1', '1.0', '9', ''))}",
-        f"Host: {rng.choice(('127.0.0.1', 'evil.example', '', 'a' * 3000))}",
+        f"{method} {rng.choice(paths)}{more} HTTP/{one('1.1', ('1.0', '9', ''))}",
+        f"Host: {one(own[7:], ('evil.example', '', 'a' * 3000))}",
         "Connection: close",
-        f"Content-Length: {rng.choice((*[len(body)] * 12, -1, 10**12, 'x'))}",
+        f"Content-Length: {one(str(len(body)), (-1, 10**12, 'x'))}",
     ]
     if rng.random() < 0.6:
-        lines.append(f"Cookie: {cookie if rng.random() < 0.8 else 'a=' + 'b' * rng.randint(0, 6000)}")
-    for extra in ("Origin: http://evil.example", "Upgrade: websocket", "Transfer-Encoding: chunked", "X\0: y",
-                  "X-Onedemo-Rater: 1", "Range: bytes=-1", "Expect: 100-continue", ": empty"):  # fmt: skip
-        if rng.random() < 0.15:
-            lines.append(extra)
+        lines.append(f"Cookie: {one(cookie, ('a=' + 'b' * rng.randint(0, 6000),))}")
+    if rng.random() < 0.8:
+        lines.append(f"Origin: {own}")
+    if rng.random() < 0.6:
+        lines.append(f"Content-Type: {rng.choice(kinds)}{one('', tuple(f'; charset={c}' for c in charsets))}")
+    if rng.random() < odd:
+        lines.append(f"Content-Encoding: {rng.choice(codings)}")
+    if rng.random() < 0.15:
+        lines += [f"Sec-WebSocket-Protocol: {rng.choice(protocols)}", "Sec-WebSocket-Version: 13"]
+        lines += ["Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Connection: Upgrade", "Upgrade: websocket"]
+    lines += [extra for extra in extras if rng.random() < odd]
     data = "\r\n".join(lines).encode("utf-8", "surrogateescape") + b"\r\n\r\n" + body
-    return mutated(rng, data) if rng.random() < 0.3 else data
+    return mutated(rng, data) if rng.random() < odd else data
 
 
 # --- sending it -----------------------------------------------------------------------------------
@@ -363,8 +410,9 @@ async def send_requests(port: int, cookie: str, rng: random.Random, count: int, 
             writer.close()
         findings.count("requests")
 
+    own = f"http://127.0.0.1:{port}"
     for start in range(0, count, 8):
-        await asyncio.gather(*(one(hostile_request(rng, cookie)) for _ in range(min(8, count - start))))
+        await asyncio.gather(*(one(hostile_request(rng, cookie, own)) for _ in range(min(8, count - start))))
 
 
 def add_videos(directory: Path, rng: random.Random, count: int, findings: Findings) -> None:
@@ -415,6 +463,7 @@ def attack(directory: Path, sizes: dict[str, int], seed: int) -> Findings:
     """Everything, one kind after the other."""
     findings, start = Findings(), time.monotonic()
     rng = random.Random(seed)
+    logging.getLogger().handlers = [Tracebacks(findings)]
     with serving(directory) as (page, url, link):
         port, database = int(url.rsplit(":", 1)[1]), page.trainer.store.path
         cookie, place = asyncio.run(log_in(link))
@@ -471,7 +520,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
-    logging.disable(logging.CRITICAL)
     with tempfile.TemporaryDirectory() as directory, open(os.devnull, "w") as quiet, redirect_stderr(quiet):
         findings = attack(Path(directory) / "data", QUICK if arguments.quick else FULL, arguments.seed)
     for line in findings.broken[:20]:

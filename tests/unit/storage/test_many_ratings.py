@@ -56,9 +56,9 @@ def test_what_an_open_page_asks_twice_a_second_costs_little_in_another_run_too(s
         assert store.ratings.count_for_training("next") == 0
 
     store.runs.add(run="next", demo="d", demo_sha256="0", seed=0, config="", version="0")
-    _fill(store.path, 0, 50 * 1_000)
+    _fill(store.path, 0, 50 * 450)
     small = steps_of(store, ask)
-    _fill(store.path, 50 * 1_000, 50 * 5_000)
+    _fill(store.path, 50 * 450, 50 * 1_800)
     assert steps_of(store, ask) < 1.2 * small
     assert store.ratings.last_answer(_RUN, 1) is not None
 
