@@ -22,7 +22,9 @@ from onedemo.storage.database import FILE_NAME
 from onedemo.storage.schema import check_schema
 
 _BLOCK = 1 << 20
-_OURS = re.compile(rf"(.*/)?(lock|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*")
+_OURS = re.compile(
+    rf"(.*/)?(lock|.*\.lock|address|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
+)
 """What onedemo writes into a data directory and nobody would miss in a backup."""
 _SNAPSHOT = re.compile(r"runs/([^/]+)/snapshots/(\d+)\.pt")
 

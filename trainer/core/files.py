@@ -28,7 +28,7 @@ ON_SHARED = (
 )
 
 
-def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
+def write_atomic(path: Path, data: bytes | Iterable[bytes], *, sync: bool = True) -> None:
     """Writes a file to a temporary name, syncs and renames it: a reader never sees half of it.
 
     It is as open to others as the directory that it lies in.
@@ -36,22 +36,24 @@ def write_atomic(path: Path, data: bytes | Iterable[bytes]) -> None:
     Args:
         path: Where; missing directories are made.
         data: The whole content, in one piece or in several.
+        sync: As ``replacing``.
 
     Raises:
         OSError: If the disk is full or the directory not writable; the old file is then untouched.
     """
-    with replacing(path) as temporary, temporary.open("wb") as file:
+    with replacing(path, sync=sync) as temporary, temporary.open("wb") as file:
         for block in (data,) if isinstance(data, bytes) else data:
             file.write(block)
 
 
 @contextmanager
-def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
+def replacing(path: Path, suffix: str = "", *, sync: bool = True) -> Iterator[Path]:
     """A temporary name for a file that is written by others: synced and renamed when the block ends well.
 
     Args:
         path: Where; missing directories are made.
         suffix: What the temporary name ends in, for writers that go by it.
+        sync: Whether it must survive a power cut; False for what can be made again and has a checksum.
 
     Raises:
         OSError: As ``write_atomic``.
@@ -64,12 +66,14 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
         yield temporary
         with temporary.open("rb") as file:  # whoever wrote it may have put another file under that name
             os.fchmod(file.fileno(), _as_open_as(path.parent))
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-    sync_directory(path.parent)
+    if sync:
+        sync_directory(path.parent)
 
 
 def _as_open_as(directory: Path) -> int:
