@@ -23,7 +23,7 @@ from onedemo.storage.schema import check_schema
 
 _BLOCK = 1 << 20
 _OURS = re.compile(
-    rf"(.*/)?(address|lock|.*\.lock|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
+    rf"(.*/)?(lock|.*\.lock|address|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
 )
 """What onedemo writes into a data directory and nobody would miss in a backup."""
 _SNAPSHOT = re.compile(r"runs/([^/]+)/snapshots/(\d+)\.pt")

@@ -10,17 +10,20 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from importlib import metadata
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from onedemo.core.files import archive_fault, jpeg_fault
+from onedemo.app.admin.inspection import faults_in_rows, give_up_after, seconds_for
+from onedemo.core.files import ON_SHARED, archive_fault, jpeg_fault
+from onedemo.core.shared_disks import file_system, is_shared
 from onedemo.demos.library import is_whole, list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.run_directory import RunDirectory
-from onedemo.storage.schema import STEPS, check_version
+from onedemo.storage.schema import STEPS, check_schema
 from onedemo.vision.encoders import make_encoder
 
 _LITTLE_ROOM = 1 << 30
@@ -38,11 +41,12 @@ class Finding:
     """What was found and, if it is not well, what would help."""
 
 
-def examine(data_dir: Path) -> Iterator[Finding]:
+def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
     """Looks at everything, one thing after another; a check that fails is a finding, too.
 
     Args:
         data_dir: May not be there yet: then only the installation is looked at.
+        full: Read every row of the database, too, and decode what is in it.
     """
     checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
         ("onedemo", _version),
@@ -52,7 +56,7 @@ def examine(data_dir: Path) -> Iterator[Finding]:
     ]
     if (data_dir / FILE_NAME).exists():
         checks += [
-            ("database", lambda: _database(data_dir)),
+            ("database", lambda: _database(data_dir, full)),
             ("files", lambda: _files(data_dir)),
             ("demonstrations", lambda: _demos(data_dir)),
         ]
@@ -100,7 +104,7 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
     there = data_dir.absolute()
     while not there.exists():
         there = there.parent
-    free = shutil.disk_usage(there).free
+    free, kind = shutil.disk_usage(there).free, file_system(there)
     if not os.access(there, os.W_OK):
         yield Finding(
             "disk", False, f"{there} cannot be written to: change its owner or choose another --data-dir"
@@ -110,7 +114,13 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
             "disk", False, f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about 1 GB"
         )
     else:
-        yield Finding("disk", True, f"{free / 1e9:,.0f} GB free")
+        yield Finding("disk", True, f"{free / 1e9:,.0f} GB free{f', {kind}' if kind else ''}")
+    if is_shared(there):
+        yield Finding("disk", False, f"{ON_SHARED.format(there)} ({kind})")
+    if data_dir.exists() and data_dir.stat().st_mode & 0o077:
+        yield Finding(
+            "privacy", False, f"others on this computer can look into {data_dir}: chmod -R go-rwx {data_dir}"
+        )
     secret = data_dir / "link-secret"
     if secret.exists() and secret.stat().st_mode & 0o077:
         yield Finding(
@@ -118,11 +128,11 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
         )
 
 
-def _database(data_dir: Path) -> Iterator[Finding]:
+def _database(data_dir: Path, full: bool) -> Iterator[Finding]:
     path = data_dir / FILE_NAME
     with closing(_open(path)) as db:
         try:
-            version = check_version(db)
+            version = check_schema(db)
         except ValueError as error:
             yield Finding("database", False, f"{path} was {error}")
             return
@@ -138,10 +148,21 @@ def _database(data_dir: Path) -> Iterator[Finding]:
             )
             return
         (ratings,) = db.execute("SELECT COUNT(*) FROM ratings").fetchone()
+        if full and (wrong := list(islice(faults_in_rows(db), _NAMED))):
+            yield Finding("database", False, f"{path} is damaged ({'; '.join(wrong)}): restore a backup")
+            return
+    rescued = sorted(data_dir.glob(f"{FILE_NAME}.rescued-*"))
+    if rescued:
+        yield Finding(
+            "database", False,
+            f"{_name(rescued)} was saved when the database was deleted under a server: stop onedemo and put "
+            f"it in the place of {FILE_NAME}, without {FILE_NAME}-wal and -shm, or delete it",
+        )  # fmt: skip
     schema = f"schema {version}"
     if version < max(STEPS):
         schema += f", which is brought to {max(STEPS)} when onedemo opens it"
-    yield Finding("database", True, f"whole; {_count(ratings, 'rating')}; {schema}")
+    how = "whole, every row read" if full else "whole"
+    yield Finding("database", True, f"{how}; {_count(ratings, 'rating')}; {schema}")
 
 
 def _files(data_dir: Path) -> Iterator[Finding]:
@@ -206,7 +227,9 @@ def _demos(data_dir: Path) -> Iterator[Finding]:
 
 
 def _open(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
+    db = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10)
+    give_up_after(db, seconds_for(path))
+    return db
 
 
 def _broken(paths: Iterable[Path], fault: Callable[[bytes], str]) -> set[Path]:

@@ -116,7 +116,8 @@ HISTORY: dict[str, str] = {
     "predicted": "What that predictor expected, 1 to 5; empty: none.",
     "latency_ms": "From the clip or pair on screen to the press, milliseconds.",
     "created_at": "When it was: UTC, ISO 8601, milliseconds.",
-    "by": "Who left a rater out or took one in.",
+    "by": "Who left a rater out, took one in or withdrew a rating; empty: the command line, or nobody.",
+    "withdrawn": "Of an undo: why a researcher withdrew the rating.",
 }
 """Of the CSV of what does not hold any more, in order."""
 

@@ -48,7 +48,7 @@ _HISTORY = {
     **_EVENT, "clip_id?": cell.whole(1), "pair_id?": cell.whole(1), "value?": cell.whole(1, 5),
     "kind": cell.one_of("rate", "skip", "undo", "leave out", "take in", *ANSWERS),
     "repeat": cell.whole(0, 1), **_MARK, "reason?": cell.line, "snapshot?": cell.whole(0),
-    "predicted?": _PREDICTION, "by?": cell.name,
+    "predicted?": _PREDICTION, "by?": cell.name, "withdrawn?": cell.line,
 }  # fmt: skip
 
 

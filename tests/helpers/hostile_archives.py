@@ -49,6 +49,7 @@ def small_study(data_dir: Path, segment: Segment) -> None:
     picture.parent.mkdir(parents=True)
     picture.write_bytes(b"\xff\xd8 a picture \xff\xd9")
     (data_dir / "link-secret").write_bytes(b"s" * 32)
+    (data_dir / "link-secret").chmod(0o600)
 
 
 def make(hostile: Hostile, good: Path, file: Path, victim: Path) -> None:

@@ -181,7 +181,7 @@ class Comparisons:
         """What ``stream`` does not give, as ``Ratings.stream_history``: skips, undos, what was taken back."""
         return self._database.stream(
             "SELECT c.id, NULL, c.pair_id, p.run, a.name, c.answer, NULL, 0, NULL, NULL, NULL, NULL, NULL,"
-            " c.latency_ms, c.created_at, NULL"
+            " c.latency_ms, c.created_at, NULL, NULL"
             " FROM comparisons c JOIN pairs p ON p.id = c.pair_id JOIN raters a ON a.id = c.rater_id"
             " WHERE (?1 IS NULL OR p.run = ?1) AND (c.answer IN ('skip', 'undo') OR EXISTS ("
             "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
