@@ -29,7 +29,7 @@ from onedemo.storage.schema import check_version
 MANIFEST = "manifest.json"
 FORMAT = 1
 _BLOCK = 1 << 20
-_LEFT_OUT = re.compile(rf"lock|\..*|{re.escape(FILE_NAME)}.*|.*\.damaged")
+_LEFT_OUT = re.compile(rf"(.+\.)?lock|\..*|{re.escape(FILE_NAME)}.*|.*\.damaged")
 """Names of files that belong to a process, are half written, or are copied in another way."""
 _SNAPSHOT = re.compile(r"runs/([^/]+)/snapshots/(\d+)\.pt")
 
