@@ -38,6 +38,7 @@ check: .venv/.installed-test
 chaos: .venv/.installed-test
 	@mkdir -p promises
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
+	$(BIN)/python tests/data/videos.py --long
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
 	PYTHONPATH=tests $(BIN)/python tests/load/hostile_archives.py --json promises/archives.json

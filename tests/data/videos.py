@@ -532,12 +532,8 @@ def main() -> None:
                 got = said or "as expected"
                 if ffmpeg and not kind.refused and not kind.options and kind.expected[0] != -1:
                     theirs = by_ffmpeg(path)
-                    ours = [number_of(frame) for frame in frames]
-                    also = (
-                        "the same pictures"
-                        if theirs and sorted(set(theirs)) == sorted(set(ours))
-                        else f"{theirs}"
-                    )
+                    lacks = sorted({number_of(frame) for frame in frames} - set(theirs or ()))
+                    also = f"has no {told(lacks)}" if lacks else "the same pictures"
             except UserError as error:
                 got = re.sub(r"\S*/", "", str(error))
                 said = "" if kind.refused and re.search(kind.refused, str(error)) else "refused"

@@ -62,6 +62,10 @@ def visit(store, what, *, role="researcher", **limits):
     return run(go())
 
 
+told = []
+"""The names of demos that were told beside the answers."""
+
+
 def send(store, content, *, origin=None, filename="../../evil.mp4", role="researcher", limits=None, **fields):
     async def post(session, url):
         form = aiohttp.FormData()
@@ -70,6 +74,7 @@ def send(store, content, *, origin=None, filename="../../evil.mp4", role="resear
         form.add_field("video", content, filename=filename, content_type="video/mp4")
         headers = {"Origin": origin or url, PAGE_HEADER: "a"}
         async with session.post(url + "/demos", data=form, headers=headers) as answer:
+            told.append(answer.headers.get("X-Demo"))
             return answer.status, await answer.text()
 
     return visit(store, post, role=role, **(limits or {}))
@@ -81,12 +86,20 @@ def left(store):
 
 
 def test_a_video_becomes_a_demo(store, video):
-    status, said = send(store, video, start="0.2", end="0.8", crop="8, 4, 48, 40", mirror="on")
+    status, said = send(store, video, start="0.2", end="0.8", crop="8, 40, 48, 40", mirror="on")
     assert (status, said) == (200, "kick is a demo now: 0.6 s, 18 frames.")
     demo = find_demo("kick", store.path.parent / "demos")
     assert (demo.frames, demo.source) == (18, "uploaded")
     assert read_frames(demo).shape[1:] == (40, 48, 3)
     assert left(store) == [demo.sha256]  # nothing named by the client, nothing temporary
+
+
+def test_a_video_that_is_known_keeps_its_name(store, video):
+    """The page offers the name that is told, not the one that was typed."""
+    assert send(store, video)[1] == "kick is a demo now: 1.0 s, 30 frames."
+    status, said = send(store, video, name="punch", end="9")
+    assert (status, said) == (200, "This video is known already, as kick: 1.0 s, 30 frames.")
+    assert told[-2:] == ["kick", "kick"]
 
 
 def test_a_video_may_be_larger_than_other_requests(store, video):
@@ -107,7 +120,10 @@ def test_only_from_the_page(store, video):
 @pytest.mark.parametrize(
     ("content", "fields", "words"),
     [
-        (b"hello " * 999, {}, "The video is not a video that can be read"),
+        (b"\0hello " * 999, {}, "The video is not a video that can be read"),
+        (b"hello " * 999, {}, "The video is a text file"),
+        (b"", {}, r"^The video is empty \(0 bytes\): copy or download it again\.$"),
+        (b"<!doctype html><html>", {}, "^The video is a web page: download the video itself"),
         (None, {"name": "../up"}, "name"),
         (None, {"name": "a\u202eb"}, "name"),
         (None, {"name": "x" * 5000}, "Name is up to 200"),
@@ -119,7 +135,7 @@ def test_only_from_the_page(store, video):
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence(store, video, content, fields, words):
-    status, said = send(store, content or video, **fields)
+    status, said = send(store, video if content is None else content, **fields)
     assert status == 400 and re.search(words, said), said
     assert str(store.path.parent) not in said and "\n" not in said
     assert left(store) == []

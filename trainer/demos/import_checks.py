@@ -49,7 +49,7 @@ class SourceWatch:
     def __init__(self, name: str, source: Source, *, start: float, end: float | None) -> None:
         self._name, self._source, self._start, self._end = name, source, start, end
         self._seen = self._used = 0
-        self._last = self._seconds = 0.0
+        self._first = self._last = self._seconds = 0.0
 
     def frames(self) -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
         """When each picture comes, and what gives it; raises UserError once they prove too long."""
@@ -58,7 +58,7 @@ class SourceWatch:
             if self._seen > MAX_FRAMES:
                 raise UserError(f"{self._name} has more than {MAX_FRAMES} frames; cut out the part to use")
             self._last = shown.seconds
-            self._seconds = shown.seconds + (shown.lasts or 1 / self._source.fps)
+            self._seconds = shown.seconds + (shown.lasts or self._period(shown.seconds))
             self._used += self._seconds > self._start and (self._end is None or shown.seconds < self._end)
             self._check_length(shown.seconds)
             yield shown.seconds, shown.picture
@@ -105,6 +105,13 @@ class SourceWatch:
                 f"a demo lasts at least {MIN_SECONDS:g} s, as long as a clip, and {self._name} gives "
                 f"{count / fps:.2f} s between --start and --end"
             )
+
+    def _period(self, seconds: float) -> float:
+        """How long a picture stays of which the container does not say it: as long as those before."""
+        if self._seen == 1:
+            self._first = seconds
+            return 1 / self._source.fps
+        return max(1 / self._source.fps, (seconds - self._first) / (self._seen - 1))
 
     def _check_length(self, seconds: float) -> None:
         stop = seconds if self._end is None else min(seconds, self._end)

@@ -98,6 +98,8 @@ class Source:
                 options={"max_pixels": str(_MOST_PIXELS), "threads": "1"},
                 container_options={"format_whitelist": FORMATS, "protocol_whitelist": "pipe"},
             )  # fmt: skip
+        except av.MemoryError:
+            raise MemoryError from None
         except (av.FFmpegError, ValueError, OSError) as error:
             raise self._no_video() from error
         self._stream = self._choose()
@@ -246,6 +248,8 @@ class Source:
                     yield from self._stream.decode(packet)  # type: ignore[misc]
                 except av.EOFError:
                     return
+                except av.MemoryError:
+                    raise MemoryError from None
                 except av.FFmpegError:
                     self.broken += 1
         except (av.FFmpegError, OSError):  # the container breaks off
@@ -312,7 +316,7 @@ class Source:
         if self.width * self.height > _MOST_PIXELS:
             self._animation, self.fps, self.seconds = iter(()), 30.0, 0.0
             return
-        done, animation = cv2.imdecodeanimation(np.frombuffer(file.read(), np.uint8))
+        done, animation = cv2.imdecodeanimation(np.frombuffer(file.read(), np.uint8)[None])
         if not done or not len(animation.frames):
             raise UserError(
                 f"{self._name} cannot be decoded: its webp pictures are damaged; convert it to mp4"

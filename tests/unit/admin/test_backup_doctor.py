@@ -11,6 +11,7 @@ import sys
 import threading
 import zipfile
 from contextlib import closing
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -50,6 +51,12 @@ def made(tmp_path_factory, demo):
     directory = tmp_path_factory.mktemp("care") / "data"
     with closing(Store(directory)) as store:
         headless(store, demo)
+    home = directory / "demos" / demo.sha256
+    home.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(demo.path, home / "video.webm")
+    digest = hashlib.sha256(demo.path.read_bytes()).hexdigest()
+    about = asdict(demo) | {"path": "", "video_sha256": digest}
+    (home / "demo.json").write_text(json.dumps(about))
     video = make_video(tmp_path_factory.mktemp("video") / "mine.mp4")
     import_video(video, name="mine", demos_dir=directory / "demos")
     read_secret(directory)
@@ -225,7 +232,7 @@ def test_the_doctor_finds_nothing_wrong_with_what_a_run_leaves(data_dir, capsys)
     wrong, lines = doctor(data_dir, capsys)
     assert not wrong, wrong
     text = "\n".join(lines)
-    for said in ("all as needed", "the robot can be drawn", "18 ratings; schema", "1 video of your own"):
+    for said in ("all as needed", "the robot can be drawn", "18 ratings; schema", "2 videos of your own"):
         assert said in text
 
 
@@ -260,6 +267,12 @@ def orphan_rows(data_dir):
         db.commit()
 
 
+def lose_demo(data_dir):
+    with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:
+        (sha256,) = db.execute("SELECT demo_sha256 FROM runs").fetchone()
+    shutil.rmtree(data_dir / "demos" / sha256)
+
+
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
@@ -271,6 +284,7 @@ def orphan_rows(data_dir):
         (lambda d: newest(d).rename(f"{newest(d)}.damaged"), r"set aside .*\.damaged"),
         (lambda d: flip(next(d.glob("demos/*/video.webm"))), "demos/.* damaged: delete it and add the video"),
         (lambda d: next(d.glob("demos/*/video.webm")).unlink(), "demos/.* damaged: delete it"),
+        (lose_demo, "run falling-1 cannot go on, its demo .* is gone: put demos/"),
         (lambda d: (d / "link-secret").chmod(0o644), "others may read .*chmod 600"),
         (lambda d: next(iter(d.glob("demos/*"))).joinpath("features-x.npz").write_bytes(b"PK"), "made anew"),
         (spoil_database, r"onedemo\.sqlite3 is damaged|malformed|not a database"),

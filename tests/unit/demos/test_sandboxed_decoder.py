@@ -17,6 +17,7 @@ from onedemo.demos import sandboxed_decoder
 from onedemo.demos.decoder_child import shaped_frames
 from onedemo.demos.library import import_video
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
+from onedemo.demos.source import THREADS
 from onedemo.errors import UserError
 from unit.demos.test_library import make_video, refused
 
@@ -240,3 +241,21 @@ def test_the_child_can_open_no_file(tmp_path, monkeypatch):
     run_child_after(monkeypatch, attack)
     with pytest.raises(UserError, match=r"OSError: \[Errno 24\] Too many open files: '/etc/passwd'"):
         list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+
+
+def test_the_child_takes_the_same_on_any_machine(tmp_path, monkeypatch):
+    """Threads by cores, and an arena of address space for each, made a phone's video too large on 16."""
+    seen = []
+    child = subprocess.Popen
+    monkeypatch.setattr(
+        sandboxed_decoder.subprocess, "Popen",
+        lambda command, **how: seen.append((child(command, **how), how["env"])) or seen[-1][0],
+    )  # fmt: skip
+    frames = decode(make_video(tmp_path / "a.avi", count=90, size=(640, 480)), Options())
+    next(frames)
+    process, env = seen[0]
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    frames.close()
+    assert int(re.search(r"Threads:\s+(\d+)", status)[1]) <= 1 + THREADS
+    assert int(re.search(r"VmPeak:\s+(\d+)", status)[1]) / 1024 < 1024
+    assert env["MALLOC_ARENA_MAX"] == "2"

@@ -7,10 +7,11 @@ import sys
 
 import numpy as np
 import pytest
-from data.videos import KINDS, at_rate, jittered
+from data.videos import KINDS, at_rate, jittered, number_of
 
 from helpers.paths import ROOT
 from onedemo.demos.resampling import resample
+from onedemo.demos.source import Source
 
 pytestmark = pytest.mark.seam
 
@@ -111,3 +112,14 @@ def test_whole_ratios_stay_even_where_stamps_jitter(rate, fps):
         stamped = ((at, i) for i, at in enumerate(jittered(120, rate, within, seed)))
         shown = list(resample(stamped, fps=fps, lasts=lambda: 1 / rate, start=0.0, end=np.inf))
         assert shown == at_rate(120, rate, fps), seed
+
+
+def test_a_part_far_from_the_start_is_sought(tmp_path):
+    """5 s of an hour are had in a second; all before it were decoded, which took too long."""
+    (kind,) = [kind for kind in KINDS if kind.file == "ten-minutes.mp4"]
+    kind.make(tmp_path / kind.file)
+    with (tmp_path / kind.file).open("rb") as file, Source(file, kind.file) as source:
+        shown = source.frames(590.0)
+        first = next(shown)
+        assert 584 < first.seconds <= 590 and number_of(first.picture()) == round(first.seconds * 10) % 1000
+        assert sum(1 for _ in shown) < 160
