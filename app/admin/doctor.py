@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from packaging.requirements import Requirement
 
+from onedemo.config import RunConfig, load_config
 from onedemo.core.files import archive_fault, jpeg_fault
 from onedemo.demos.library import list_demos
 from onedemo.errors import UserError
@@ -23,9 +24,9 @@ from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_version
+from onedemo.training.runs import disk_needed
 from onedemo.vision.encoders import make_encoder
 
-_LITTLE_ROOM = 1 << 30
 _NAMED = 3
 """Files of a kind that are named; of more, the number."""
 
@@ -125,17 +126,27 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
         yield Finding(
             "disk", False, f"{there} cannot be written to: change its owner or choose another --data-dir"
         )
-    elif free < _LITTLE_ROOM:
+    elif free < 2 * (needed := _needed(data_dir)):
         yield Finding(
-            "disk", False, f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about 1 GB"
-        )
+            "disk", False,
+            f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about {needed / 1e6:,.0f} MB",
+        )  # fmt: skip
     else:
-        yield Finding("disk", True, f"{free / 1e9:,.0f} GB free")
+        yield Finding("disk", True, f"{free / 1e9:,.1f} GB free; a run needs about {needed / 1e6:,.0f} MB")
     secret = data_dir / "link-secret"
     if secret.exists() and secret.stat().st_mode & 0o077:
         yield Finding(
             "secret", False, f"others may read {secret}, which is behind all links: chmod 600 {secret}"
         )
+
+
+def _needed(data_dir: Path) -> float:
+    """Bytes that a run like the newest takes, or one with the defaults."""
+    files = sorted(data_dir.glob("runs/*/config.toml"), key=lambda file: file.stat().st_mtime)
+    try:
+        return disk_needed(load_config(files[-1]) if files else RunConfig())
+    except UserError:  # of a later version, or damaged: opening the run says so
+        return disk_needed(RunConfig())
 
 
 def _database(data_dir: Path) -> Iterator[Finding]:
