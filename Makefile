@@ -34,7 +34,7 @@ check: .venv/.installed-test
 	@rm -rf build/typed && mkdir -p build/typed && cp -R trainer build/typed/onedemo && cp -R app static build/typed/onedemo
 	$(BIN)/pyright --level error --pythonpath $(BIN)/python
 
-# What the tests do in seconds, for long: 20 minutes, and two hours. Tables of figures are left in promises/.
+# What the tests do in seconds, for long: three quarters of an hour, and two hours. Tables of figures are left in promises/.
 chaos: .venv/.installed-test
 	@mkdir -p promises
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
@@ -42,8 +42,10 @@ chaos: .venv/.installed-test
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
 	PYTHONPATH=tests $(BIN)/python tests/load/hostile_archives.py --json promises/archives.json
+	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 120 --films 8 --json promises/films.json
+	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 1200 --json promises/drawn.json
 	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json \
-	  promises/archives.json
+	  promises/archives.json promises/films.json promises/drawn.json
 
 soak: .venv/.installed-test
 	@mkdir -p promises

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from onedemo.app.admin.inspection import faults_in_rows, give_up_after, seconds_for
+from onedemo.config import RunConfig, load_config
 from onedemo.core.files import ON_SHARED, archive_fault, jpeg_fault
 from onedemo.core.shared_disks import file_system, is_shared
 from onedemo.demos.library import is_whole, list_demos
@@ -24,9 +25,9 @@ from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_schema
+from onedemo.training.runs import disk_needed
 from onedemo.vision.encoders import make_encoder
 
-_LITTLE_ROOM = 1 << 30
 _NAMED = 3
 """Files of a kind that are named; of more, the number."""
 
@@ -109,12 +110,14 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
         yield Finding(
             "disk", False, f"{there} cannot be written to: change its owner or choose another --data-dir"
         )
-    elif free < _LITTLE_ROOM:
+    elif free < 2 * (needed := _needed(data_dir)):
         yield Finding(
-            "disk", False, f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about 1 GB"
-        )
+            "disk", False,
+            f"{free / 1e6:,.0f} MB free for {there}: make room, a run needs about {needed / 1e6:,.0f} MB",
+        )  # fmt: skip
     else:
-        yield Finding("disk", True, f"{free / 1e9:,.0f} GB free{f', {kind}' if kind else ''}")
+        what = f"{free / 1e9:,.1f} GB free{f', {kind}' if kind else ''}"
+        yield Finding("disk", True, f"{what}; a run needs about {needed / 1e6:,.0f} MB")
     if is_shared(there):
         yield Finding("disk", False, f"{ON_SHARED.format(there)} ({kind})")
     if data_dir.exists() and data_dir.stat().st_mode & 0o077:
@@ -126,6 +129,15 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
         yield Finding(
             "secret", False, f"others may read {secret}, which is behind all links: chmod 600 {secret}"
         )
+
+
+def _needed(data_dir: Path) -> float:
+    """Bytes that a run like the newest takes, or one with the defaults."""
+    files = sorted(data_dir.glob("runs/*/config.toml"), key=lambda file: file.stat().st_mtime)
+    try:
+        return disk_needed(load_config(files[-1]) if files else RunConfig())
+    except UserError:  # of a later version, or damaged: opening the run says so
+        return disk_needed(RunConfig())
 
 
 def _database(data_dir: Path, full: bool) -> Iterator[Finding]:

@@ -49,6 +49,7 @@ _COMMANDS = {
     "admin:backup": "Everything in one file, also while the server runs.",
     "admin:restore": "A backup into a new data directory.",
     "admin:doctor": "What is wrong with installation and data, if anything.",
+    "tidy:tidy": "Pictures that can be drawn again, deleted.",
     "baseline:baseline": "What the method is compared with.",
     "bench:bench": "Measure the program and the method.",
 }

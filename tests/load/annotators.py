@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from urllib.parse import urljoin, urlsplit
 from uuid import uuid4
@@ -29,6 +29,8 @@ _WAITING = 'class="od-waiting"'
 _SIZES = 16
 """Bytes before the compressed part of a message: its size when unpacked, and as it is."""
 _PATIENCE_S = 20.0
+_NO_CLIP_S = 300.0
+"""Practice may take so long on a busy machine, and new clips are cut after it."""
 _JUDGING_S = 0.35
 """Nobody judges a clip sooner, and the page takes no rating that comes within 0.3 s."""
 _CAMERA = {
@@ -102,6 +104,19 @@ class Tab:
         press = Press(clip=before, value=value, at=at, seconds=time.perf_counter() - began)
         self.presses.append(press)
         return press
+
+    async def next_clip(self) -> None:
+        """Waits for a clip after the note that there is none; the press before has taken so much longer.
+
+        Raises:
+            RuntimeError: If none comes within minutes.
+        """
+        began = time.perf_counter()
+        await self.until(lambda: self.clip is not None, "another clip", _NO_CLIP_S)
+        assert self.clip is not None
+        await self._pictures[self.clip]
+        last = self.presses[-1]
+        self.presses[-1] = replace(last, seconds=last.seconds + time.perf_counter() - began)
 
     async def post(self, **press: object) -> tuple[int, str]:
         """Sends a press, as a browser does; status and text of what is answered to it."""
@@ -255,8 +270,10 @@ async def rate_for(tabs: Sequence[Tab], *, every_s: float, seconds: float) -> No
         every_s: Seconds from press to press of one person.
         seconds: How long.
 
+    Where somebody has no clip to rate, the time until one comes counts as well.
+
     Raises:
-        ExceptionGroup: Of RuntimeErrors, as ``Tab.rate``, or if the clips run out.
+        ExceptionGroup: Of RuntimeErrors, as ``Tab.rate``, or if no more clips come.
     """
     end = time.monotonic() + seconds
 
@@ -266,7 +283,7 @@ async def rate_for(tabs: Sequence[Tab], *, every_s: float, seconds: float) -> No
             await asyncio.sleep(due - time.monotonic())
             await tab.rate(rating(tab))
             if tab.clip is None:
-                raise RuntimeError("there were not enough clips: somebody has none to rate")
+                await tab.next_clip()
             due = max(due + every_s, time.monotonic())
 
     began = time.monotonic()

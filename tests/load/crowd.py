@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def measure(quick: bool) -> list[Result]:
 
 
 async def _measure(data_dir: Path, seconds: float) -> list[Result]:
-    async with stocked(data_dir, presses=int(PEOPLE * seconds / EVERY_S), people=PEOPLE) as study:
+    async with stocked(data_dir, people=PEOPLE) as study:
         return await crowd(study, people=PEOPLE, every_s=EVERY_S, seconds=seconds)
 
 
@@ -40,7 +41,7 @@ async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) 
     """People who all rate at a steady pace while the robot practises.
 
     Args:
-        study: With clips in stock for all.
+        study: With clips for all.
         people: How many.
         every_s: Seconds from press to press of each.
         seconds: How long.
@@ -51,8 +52,9 @@ async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) 
     await bring(study.session, study.server, "online")
     await study.open(people)
     await asyncio.sleep(_SETTLE_S)
-    before, start = study.iterations(), study.server.resident_mib()
+    before, start, began = study.iterations(), study.server.resident_mib(), time.monotonic()
     taken = await study.rate(every_s, seconds)
+    pace = len(taken) / (time.monotonic() - began)
     end, iterations = study.server.resident_mib(), study.iterations() - before
     study.check()
     # On a busy machine an iteration may outlast a short turn; one that never ends is a fault.
@@ -60,12 +62,13 @@ async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) 
     count = len(taken)
     how = (
         f"{people} sockets, each a rating every {every_s:g} s for {seconds:g} s, {iterations} iterations of "
-        f"practice meanwhile; {count} ratings counted in the database; clips drawn before, copies of a few"
+        f"practice meanwhile; {count} ratings counted in the database; each clip drawn for it"
     )
     return [
         single("crowd_press_ms", f"press to next clip and its picture, 95th percentile, {people} people",
                [float(np.percentile(taken, 95))], unit="ms", how=how),
         single("crowd_press_median_ms", "the same, median", [float(np.median(taken))], unit="ms", how=how),
+        single("crowd_pace", "ratings a second, all together", [pace], unit="1/s", how=how),
         single("crowd_lost", f"ratings lost or doubled, of {count}", [0.0], unit="", reach=0, how=how),
         single("crowd_memory_start_mib", "memory of the server as they begin", [start], unit="MiB", how=how),
         single("crowd_memory_end_mib", "memory of the server at the end", [end], unit="MiB", how=how),

@@ -74,7 +74,7 @@ def measure(quick: bool) -> list[Result]:
 
 
 async def _measure(data_dir: Path, turns: int, presses: int) -> list[Result]:
-    async with stocked(data_dir, presses=2 * turns * presses, people=1) as study:
+    async with stocked(data_dir, people=5) as study:
         return await press_to_paint(study, turns=turns, presses=presses)
 
 
@@ -82,7 +82,7 @@ async def press_to_paint(study: Stocked, *, turns: int, presses: int) -> list[Re
     """Key press to the next clip painted, while the trainer runs and while it is paused.
 
     Args:
-        study: With as many clips in stock; its other people rest.
+        study: Its other people rest.
         turns: Of each side.
         presses: In a turn.
     """
@@ -92,7 +92,6 @@ async def press_to_paint(study: Stocked, *, turns: int, presses: int) -> list[Re
     async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=find_chromium(), args=CHROMIUM_FLAGS)
         page = await browser.new_page(viewport={"width": 1440, "height": 900})
-        study.fill(2 * turns * presses)
         await page.goto(annotator_link(study.server, study.store, "at a browser"))
         await page.wait_for_selector(_SHOWN, timeout=1000 * _PATIENCE_S)
         await page.evaluate(_WATCH)
@@ -104,7 +103,7 @@ async def press_to_paint(study: Stocked, *, turns: int, presses: int) -> list[Re
     how = (
         f"95th percentile of {presses} presses, {turns} turns by turns with practice paused; Chromium with "
         "WebGL in software on the same cores; from the key's time stamp to the frame after the picture was "
-        "drawn; clips drawn before, copies of a few"
+        "drawn; each clip drawn for it"
     )
     return [
         single("painted_ms", "key press to next clip painted, 95th percentile, training", p95["online"],

@@ -110,8 +110,7 @@ async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
 
 
 async def _presses(data_dir: Path, turns: int, seconds: float) -> list[Result]:
-    presses = sum(2 * turns * seconds * people / pause for people, pause in _EVERY_S.items())
-    async with stocked(data_dir, presses=int(presses), people=CROWD) as study:
+    async with stocked(data_dir, people=CROWD) as study:
         return await press_times(study, turns=turns, seconds=seconds)
 
 
@@ -121,7 +120,7 @@ async def press_times(
     """Key press to next clip, while the trainer runs and while it is paused.
 
     Args:
-        study: With clips in stock for all.
+        study: With clips for all.
         turns: Of each side.
         seconds: Of a turn.
         every_s: Seconds from press to press of each person, by how many they are, ascending.
@@ -148,8 +147,8 @@ def _press_figure(people: int, pause: float, p95: dict[str, list[float]]) -> Fig
         name, f"key press to next clip, 95th percentile, people rating: {people}, each every {pause:g} s",
         ours=p95["online"], theirs=p95["paused"], against="trainer paused", unit="ms", reach=2,
         at_least=False,
-        equal="one server and its open pages by turns; clips drawn before, copies of a few; the clock stops "
-        "when the next clip and its picture are there",
+        equal="one server and its open pages by turns; each clip drawn for it; the clock stops when the next "
+        "clip and its picture are there",
     )  # fmt: skip
 
 

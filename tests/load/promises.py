@@ -26,6 +26,23 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
             ("integrity checks that failed", f"{found['damaged']}"),
             ("slowest start after a kill", f"{found['slowest_start_s']:.1f} s"),
         ]
+    if "a_second" in found:
+        who = f"{found['people']} people, each every {found['every_s']:g} s"
+        films = f" beside {found['films']} films" if found["films"] else ""
+        drawn = [
+            (
+                f"{who}, every clip drawn{films}: ratings a second, of those wanted",
+                f"{found['a_second']:.1f} of {found['people'] / found['every_s']:.1f}",
+            ),
+            (
+                f"press to next clip and picture{films}: median, 95th percentile, slowest",
+                f"{found['median_ms']:.0f}, {found['p95_ms']:.0f}, {found['slowest_ms']:.0f} ms",
+            ),
+            (f"ratings counted in the database{films}", f"{found['ratings']:,}: 0 lost, 0 doubled"),
+        ]
+        if films:
+            drawn.append(("slowest of those films", f"{found['slowest_film_s']:.0f} s"))
+        return drawn
     if "mib" in found:
         return [("hours of rating and training", found["line"])]
     if "hostile archives" in found:

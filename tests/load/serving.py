@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
-import os
 import re
 import secrets
 import sqlite3
@@ -23,17 +22,15 @@ from typing import IO
 from aiohttp import ClientSession
 
 from load.annotators import Press, Tab, browser_session, open_tab, rate_for, rating
-from onedemo.storage.clips import NewClip
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 
 FEW_STATES = ("practice.random_lanes=8", "practice.bank_tries=500", "ratings.queue=4")
 """Settings of a run that is not to learn anything: it begins 5 s sooner, and draws fewer clips."""
 _PATIENCE_S = 900.0
-_IN_HAND = 2
-"""Clips at each open page: one on screen, one fetched ahead."""
-_SPARE = 50
-"""Clips beyond those, for the second until more are brought."""
+_AHEAD = 4
+"""Clips that wait for each person: as many as one rates while the robot practises once."""
+_SPARE = 12
 
 
 class Server:
@@ -101,11 +98,11 @@ class Server:
             return json.load(answer)["phase"]
 
     def peak_mib(self) -> float:
-        """The most memory the process has had at once, MiB (Linux)."""
+        """The most memory that it and the process that draws have had at once, MiB (Linux)."""
         return self._memory("VmHWM")
 
     def resident_mib(self) -> float:
-        """The memory the process has just now, MiB (Linux)."""
+        """The memory that both have just now, MiB (Linux)."""
         return self._memory("VmRSS")
 
     def rows(self, sql: str, *values: object) -> list[tuple]:
@@ -115,10 +112,14 @@ class Server:
             return db.execute(sql, values).fetchall()
 
     def _memory(self, what: str) -> float:
-        status = Path(f"/proc/{self._child.pid}/status").read_text()
-        found = re.search(rf"{what}:\s+(\d+) kB", status)
-        assert found is not None, f"the kernel tells no {what}"
-        return int(found[1]) / 1024
+        process = Path(f"/proc/{self._child.pid}")
+        draws = {child for task in process.glob("task/*/children") for child in task.read_text().split()}
+        total = 0
+        for pid in [process.name, *draws]:
+            found = re.search(rf"{what}:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+            assert found is not None, f"the kernel tells no {what}"
+            total += int(found[1])
+        return total / 1024
 
     def kill(self) -> None:
         """Ends the process as a power cut would."""
@@ -146,51 +147,6 @@ def serving(data_dir: Path, settings: Sequence[str] = ()) -> Iterator[Server]:
         yield server
     finally:
         server.close()
-
-
-class Supply:
-    """Clips that wait to be rated: drawn ones once more, under numbers of their own.
-
-    Drawing takes part of a second of a core for each clip, so many people would wait for pictures and
-    not for the page.
-
-    Args:
-        store: Of the server's data directory.
-        run: The run that is served; drawn clips of it must wait.
-        count: How many clips to make.
-    """
-
-    def __init__(self, store: Store, run: str, count: int) -> None:
-        self._store, self._run = store, run
-        drawn = store.clips.waiting(self._run)
-        pictures = store.path.parent / "runs" / self._run / "clips"
-        segments = {clip.id: store.clips.segment(clip.id) for clip in drawn}
-        originals = [drawn[n % len(drawn)] for n in range(count)]
-        new = [
-            NewClip(demo_step=clip.demo_step, segment=segments[clip.id], stage="online", iteration=1)
-            for clip in originals
-        ]
-        self._left = [clip.id for clip in store.clips.add(self._run, new)]
-        for clip, original in zip(self._left, originals, strict=True):
-            os.link(pictures / f"{original.id:06d}.jpg", pictures / f"{clip:06d}.jpg")
-
-    def fill(self, queue: int) -> None:
-        """Lets so many clips wait to be rated.
-
-        Raises:
-            RuntimeError: If there are no more.
-        """
-        missing = max(0, queue - len(self._store.clips.waiting(self._run)))
-        if missing > len(self._left):
-            raise RuntimeError("more clips were rated than were made")
-        self._store.clips.set_state(self._left[:missing], "ready")
-        del self._left[:missing]
-
-    async def keep(self, queue: int) -> None:
-        """Fills once a second until cancelled."""
-        while True:
-            await asyncio.to_thread(self.fill, queue)
-            await asyncio.sleep(1.0)
 
 
 def annotator_link(server: Server, store: Store, name: str) -> str:
@@ -255,28 +211,22 @@ async def bring(session: ClientSession, server: Server, phase: str) -> None:
 
 @dataclass
 class Stocked:
-    """A server with drawn clips in stock, and people who rate them. Made by ``stocked``."""
+    """A server that practises and draws each clip that it serves, and people. Made by ``stocked``."""
 
     server: Server
     store: Store
     session: ClientSession
-    supply: Supply
     tabs: list[Tab]
     before: int
     """The last event before anybody rated."""
 
-    def fill(self, clips: int) -> None:
-        """Lets so many clips wait to be rated, beside those at open pages."""
-        self.supply.fill(_IN_HAND * len(self.tabs) + _SPARE + clips)
-
     async def open(self, people: int) -> None:
         """Opens pages until so many people are there, each with a clip."""
-        self.supply.fill(_IN_HAND * people + _SPARE)
         for number in range(len(self.tabs), people):
             link = annotator_link(self.server, self.store, f"annotator {number}")
             self.tabs.append(await open_tab(self.session, link))
         for tab in self.tabs:
-            await tab.until(lambda tab=tab: tab.clip, "a clip")
+            await tab.until(lambda tab=tab: tab.clip, "a clip", _PATIENCE_S)
 
     async def rate(self, every_s: float, seconds: float) -> list[float]:
         """Lets all rate for a while, as ``rate_for``.
@@ -285,17 +235,17 @@ class Stocked:
             Of each press, the time until the next clip and its picture were there, ms.
         """
         told = [len(tab.presses) for tab in self.tabs]
-        filling = asyncio.create_task(self.supply.keep(_IN_HAND * len(self.tabs) + _SPARE))
-        try:
-            await rate_for(self.tabs, every_s=every_s, seconds=seconds)
-        finally:
-            filling.cancel()
+        await rate_for(self.tabs, every_s=every_s, seconds=seconds)
         pairs = zip(self.tabs, told, strict=True)
         return [1000 * press.seconds for tab, n in pairs for press in tab.presses[n:]]
 
     def iterations(self) -> int:
         """Iterations of practice in the database, of all runs."""
         return self.server.rows("SELECT COUNT(*) FROM iterations")[0][0]
+
+    def drawn(self) -> int:
+        """Clips that have been drawn, of all runs."""
+        return self.server.rows("SELECT COUNT(*) FROM clips WHERE state != 'cut'")[0][0]
 
     def check(self) -> None:
         """As ``check_counts``, of all that was rated here."""
@@ -304,21 +254,19 @@ class Stocked:
 
 
 @asynccontextmanager
-async def stocked(
-    data_dir: Path, *, presses: int, people: int, settings: Sequence[str] = ()
-) -> AsyncIterator[Stocked]:
-    """A server that practises and need not draw: clips in stock are copies of a few.
+async def stocked(data_dir: Path, *, people: int, settings: Sequence[str] = ()) -> AsyncIterator[Stocked]:
+    """A server that practises, with clips for so many people at once drawn ahead, and more drawn as they go.
 
     Args:
         data_dir: A new one, or one that was used.
-        presses: How many there will be, about.
-        people: How many there will be at once, at most.
+        people: How many there will be, at most.
         settings: More ``section.key=value``.
     """
     # Few ratings before practice; afterwards nothing ends the run or takes clips away. The rest is as ever.
+    queue = _AHEAD * people + _SPARE
     settings = [
         "ratings.pretrain=10", "ratings.online=1000000", "ratings.stale_iterations=1000000",
-        "rollouts.total_steps=1000000000", *settings,
+        "rollouts.total_steps=1000000000", *settings, f"ratings.queue={queue}",
     ]  # fmt: skip
     with serving(data_dir, settings) as server, closing(Store(data_dir)) as store:
         before = store.ratings.last_event()
@@ -327,8 +275,7 @@ async def stocked(
             await give(tabs[0], 10)
             await bring(session, server, "paused")
             run = store.runs.all()[-1]["id"]
-            await reach(lambda: store.clips.waiting(run), "clips that are drawn")
-            supply = Supply(store, run, int(1.2 * presses) + _IN_HAND * people + 2 * _SPARE)
-            yield Stocked(server, store, session, supply, tabs, before)
+            await reach(lambda: len(store.clips.waiting(run)) > queue / 2, "clips that are drawn")
+            yield Stocked(server, store, session, tabs, before)
             for tab in tabs:
                 await tab.close()

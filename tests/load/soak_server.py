@@ -88,7 +88,7 @@ async def soak(data_dir: Path, minutes: float, *, people: int = PEOPLE) -> Soak:
         RuntimeError: If a rating was lost or doubled.
     """
     seen, step = Soak(), 60 * minutes / _SAMPLES
-    async with stocked(data_dir, presses=int(people * 60 * minutes / EVERY_S), people=people) as study:
+    async with stocked(data_dir, people=people) as study:
         await bring(study.session, study.server, "online")
         await study.open(people)
         rating = asyncio.ensure_future(study.rate(EVERY_S, 60 * minutes))

@@ -31,7 +31,7 @@ def test_presses_are_timed_until_the_next_clip_is_there_and_painted(data_dir, ch
     """One server for all of it. Raises if a press is lost or doubled."""
 
     async def all_of_it():
-        async with stocked(data_dir, presses=80, people=5, settings=QUICK) as study:
+        async with stocked(data_dir, people=5, settings=QUICK) as study:
             return (
                 await product.press_times(study, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}),
                 await crowd.crowd(study, people=5, every_s=0.5, seconds=2.0),

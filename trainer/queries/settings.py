@@ -36,7 +36,7 @@ class RatingsConfig:
     rounds: int = 10
     """A simulated rater's first ratings come in so many rounds, with a refit after each."""
     queue: int = 12
-    """Clips kept ready to be rated."""
+    """Clips kept ready to be rated, at least: twice as many as people rate while the robot practises once."""
     stale_iterations: int = 10
     """A clip that nobody has rated expires after so many iterations: the policy has moved on."""
     online_share: float = 0.5

@@ -61,6 +61,8 @@ class RatingQueue:
     def __init__(self, store: Store, run: str, config: RunConfig, simulated: Simulated | None) -> None:
         self._store, self._run, self._config, self._simulated = store, run, config, simulated
         self._declined = 0
+        self._seen = (0, 0)
+        self._pace = 0
         self.clips: ClipMaker | None = None
         """Draws clips for people; None if nobody looks."""
 
@@ -159,8 +161,17 @@ class RatingQueue:
         given = self.given()
         if self._simulated is not None:
             return self._due(learner, snapshot) - given
-        queue = min(self._config.ratings.queue, self.target - given)
+        wanted = max(self._config.ratings.queue, 2 * self._ratings_an_iteration(learner.iteration, given))
+        queue = min(wanted, self.target - given)
         return queue - len(waiting) if len(waiting) <= _FULL * queue else 0
+
+    def _ratings_an_iteration(self, iteration: int, given: int) -> int:
+        """How many came during the last one: clips are cut between two, so as many must wait at the least."""
+        before, given_before = self._seen
+        if iteration != before:
+            self._pace = given - given_before if iteration == before + 1 else 0
+            self._seen = (iteration, given)
+        return self._pace
 
     def _answer(self, simulated: Simulated, clips: list[Clip], segments: list[Segment]) -> bool:
         """Has clips rated by the simulated rater; whether it declined any."""

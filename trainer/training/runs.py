@@ -25,6 +25,17 @@ def program_version() -> str:
     return version("onedemo")
 
 
+def disk_needed(config: RunConfig) -> float:
+    """Bytes that a run takes on the disk when it is done, about.
+
+    A rating takes a segment and its events; an iteration a snapshot, its best rollout and the segments of
+    clips that nobody rated; to these come two checkpoints, SQLite's log, and the features of a demo.
+    """
+    ratings = config.ratings.pretrain + config.ratings.online
+    iterations = config.rollouts.total_steps / (config.rollouts.lanes * config.rollouts.steps)
+    return config.storage.pictures_gb * 1e9 + 10e3 * ratings + 55e3 * iterations + 30e6
+
+
 def find_run(
     store: Store, data_dir: Path, demo: Demo, *, name: str | None, wanted: RunConfig | None
 ) -> tuple[str, RunConfig] | None:

@@ -1,6 +1,8 @@
 """Backup, restore and doctor, on data that real runs made, with files that are really damaged."""
 
+import hashlib
 import io
+import json
 import os
 import re
 import shutil

@@ -1,6 +1,7 @@
 """The pictures of a run: drawn once, drawn again when somebody looks back, deleted in time."""
 
 import os
+import re
 import threading
 import time
 from concurrent.futures import Future
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.small_world import falling_demo, small_config
+from onedemo.app.cli.main import main
 from onedemo.core.files import jpeg_fault
 from onedemo.demos.library import find_demo
 from onedemo.render.renderer import Order, RenderThread
@@ -98,7 +100,7 @@ def thousand(store):
 
 
 @pytest.mark.seam
-def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp_path):
+def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp_path, capsys):
     """One picture in a hundred is drawn for real; the others are copies under their numbers."""
     demo = falling_demo(tmp_path / "demo")
     with closing(Store(tmp_path)) as store, RenderThread(exact=False) as drawing:
@@ -124,6 +126,14 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         assert all(path.exists() for path in awaited(store, files)) and len(awaited(store, files)) == 12
         assert files.clip(rated[-1].id).exists() and not files.clip(rated[0].id).exists()  # the newest stay
 
+        assert main(["tidy", "--show", "--data-dir", str(tmp_path)]) == 0
+        said = capsys.readouterr().out
+        held, could = map(float, re.findall(r"([0-9.]+) MB", said)[:2])
+        needed = sum(path.stat().st_size for path in awaited(store, files))
+        assert held == pytest.approx(left / MB, abs=0.06)
+        assert could == pytest.approx((left - needed) / MB, abs=0.06) and "without --show" in said
+        assert sum(size for _, size, _ in pictures_of(files)) == left
+
         # Somebody takes back what was rated first: its picture is the same again.
         looked = clips[100]
         assert not files.clip(looked.id).exists()
@@ -134,6 +144,8 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         assert again.exists()  # it was asked for just now
         tidy(store, files, 0, now=time.time() + 100)
         assert {path for path, _, _ in pictures_of(files)} == awaited(store, files)
+        assert main(["tidy", "--data-dir", str(tmp_path)]) == 0
+        assert "0.0 MB freed" in capsys.readouterr().out
 
 
 @pytest.mark.seam

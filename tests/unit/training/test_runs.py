@@ -6,7 +6,7 @@ import pytest
 from onedemo.config import load_config
 from onedemo.errors import UserError
 from onedemo.storage.store import Store
-from onedemo.training.runs import add_run, find_run
+from onedemo.training.runs import add_run, disk_needed, find_run
 from onedemo.types import Demo
 
 DEMO = Demo(name="flip", sha256="aa", path=Path("flip.webm"), fps=30.0, frames=60, width=8, height=8)
@@ -52,6 +52,21 @@ def test_settings_that_contradict_the_run_are_refused(store, tmp_path):
 def test_a_run_may_go_on_on_another_device(store, tmp_path):
     run = add_run(store, tmp_path, DEMO, load_config(None, {"device": "cuda"}), name=None)
     assert find_run(store, tmp_path, DEMO, name=run, wanted=load_config()) == (run, load_config())
+
+
+def test_a_run_may_go_on_with_another_ceiling_for_its_pictures(store, tmp_path):
+    run = add_run(store, tmp_path, DEMO, load_config(), name=None)
+    wanted = load_config(None, {"storage.pictures_gb": 1.5})
+    assert find_run(store, tmp_path, DEMO, name=run, wanted=wanted) == (run, wanted)
+
+
+def test_what_a_run_needs_grows_with_its_ratings_and_not_with_their_pictures():
+    def needed(**changes):
+        return disk_needed(load_config(None, {key.replace("__", "."): v for key, v in changes.items()})) / 1e6
+
+    assert 60 < needed() < 120
+    assert needed(ratings__online=10_000) - needed() == pytest.approx(98.5, abs=0.1)
+    assert needed(storage__pictures_gb=2.0) - needed() == pytest.approx(1980)
 
 
 def test_another_video_under_the_same_name_is_refused(store, tmp_path):
