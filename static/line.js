@@ -49,11 +49,16 @@ const line = (() => {
     return fromServer(await fetch(where, { signal: AbortSignal.timeout(settings.answerMs), ...options }));
   }
 
+  // The address of something below this person's page.
+  function here(where) {
+    return `${location.pathname.replace(/\/$/, "")}/${where}`;
+  }
+
   // Whether the server answers, and the session holds.
   async function ask() {
     askedAt = performance.now();
     try {
-      const answer = await request(`${location.pathname}/session`, { cache: "no-store" });
+      const answer = await request(here("session"), { cache: "no-store" });
       down = false;
       if (answer.status === 401) end(await reason(answer));
     } catch (error) {
@@ -192,5 +197,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, end, look, reason, request, settings, takeTab, unanswered };
+  return { Closed, answers, during, end, here, reason, request, settings, takeTab, unanswered };
 })();

@@ -41,6 +41,7 @@ _COMMANDS = {
     "run:train": "The same trainer without a browser, rated by a program.",
     "demos:demo": "Bring in and look at demonstration videos.",
     "people:rater": "People and their links.",
+    "people:rating": "Single ratings: withdraw one.",
     "people:audit": "Who signed in, took data out or changed a run.",
     "data:export": "The ratings as CSV, what was rated as Parquet.",
     "data:import_": "An export back into an empty data directory.",

@@ -131,6 +131,7 @@ class Front:
             Route("GET", "/segments.parquet", "researcher", downloads.parquet, "downloaded segments"),
             Route("GET", "/card.md", "researcher", downloads.card, "downloaded the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
+            Route("GET", r"/r/{rater:\d{1,9}}/ratings", "researcher", downloads.given),
             Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),
         )
 
