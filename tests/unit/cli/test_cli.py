@@ -25,6 +25,7 @@ from onedemo.storage.store import Store
     ("arguments", "sentence"),
     [
         ("serve --demo hoper-backflip", "did you mean hopper-backflip?"),
+        ("serve --host [::1] --demo hoper-backflip", "did you mean hopper-backflip?"),  # no other machine
         ("serve --encoder resnet", "no encoder 'resnet'; choose efficientnet-lite0 or vgg16"),
         ("serve --prt 99", "unknown option --prt; did you mean --port?"),
         ("serve --port 99999", "must be a whole number from 0 to 65535"),
