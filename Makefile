@@ -37,7 +37,8 @@ check: .venv/.installed-test
 # What the tests do in seconds, for long: three quarters of an hour, and two hours. Tables of figures are left in promises/.
 chaos: .venv/.installed-test
 	@mkdir -p promises
-	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
+	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py \
+	  tests/browser/test_line.py
 	$(BIN)/python tests/data/videos.py --long
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json

@@ -111,7 +111,7 @@ const line = (() => {
   }
 
   function unconnected() {
-    card("The page is here, but its live connection is not", [
+    card("The page is but its live connection is not", [
       "If a proxy stands before onedemo, it must pass WebSockets and the Host header on: " +
         "docs/remote-access.md has the lines for nginx and Caddy.",
       "Without a proxy: close other pages of onedemo in this browser, then reload.",
@@ -192,5 +192,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, end, look, reason, request, settings, takeTab, unanswered };
+  return { Closed, answers, during, end, reason, request, settings, takeTab, unanswered };
 })();

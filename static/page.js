@@ -3,7 +3,7 @@
 // is done here (static/player.js). Keys with Alt, such as those of the tabs, are Viser's.
 //
 // Not a module: it must have run before Viser, which begins while the page is still being read.
-(() => {
+const page = (() => {
   "use strict";
   const { forget, main, toggleSlow, watchPlayers } = clips; // static/player.js
   const { answers, settings } = line; // static/line.js
@@ -41,11 +41,12 @@
     );
   }
 
-  function flash(key) {
+  // Shows which answer was pressed, for a moment or until it is known whether it counted.
+  function flash(key, sent) {
     const button = shown(`.od-answers [data-key="${CSS.escape(key)}"]`);
     if (!button) return;
     button.classList.add("od-pressed");
-    setTimeout(() => button.classList.remove("od-pressed"), 180);
+    Promise.all([sent, new Promise((go) => setTimeout(go, 180))]).then(() => button.classList.remove("od-pressed"));
   }
 
   // What the server asks of whatever changes something: no other site can read it.
@@ -173,9 +174,10 @@
     const { dataset } = player.element;
     const press = meant(key, dataset, player.mark);
     if (!press) return;
-    flash(key);
     player.answered = !dataset.exercise;
-    send(press).then((counted) => {
+    const sent = send(press);
+    flash(key, sent);
+    sent.then((counted) => {
       if (counted) forget(player.clip);
       else player.answered = false;
     });
@@ -461,4 +463,6 @@
       "acceleration in its settings, or open the link in another browser.";
     document.body.append(note);
   });
+
+  return { post };
 })();

@@ -43,6 +43,7 @@ _COMMANDS = {
     "demos:demo": "Bring in and look at demonstration videos.",
     "people:rater": "People and their links.",
     "proxy:proxy": "Lines for nginx or Caddy before the server.",
+    "people:rating": "Single ratings: withdraw one.",
     "people:audit": "Who signed in, took data out or changed a run.",
     "data:export": "The ratings as CSV, what was rated as Parquet.",
     "data:import_": "An export back into an empty data directory.",

@@ -1,4 +1,4 @@
-"""The commands for people and their links: ``rater``, ``audit``."""
+"""The commands for people, their links and their ratings: ``rater``, ``rating``, ``audit``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ COMMAND_LINE = "command line"
 """Who did what is done here, as the audit log has it."""
 
 rater = App(name="rater", help="People and their links.")
+rating = App(name="rating", help="Single ratings.")
 
 
 @rater.command
@@ -95,6 +96,25 @@ def revoke(name: str | None = None, /, *, link: Whole | None = None, data_dir: D
         count = store.accounts.revoke_tokens(raters[name].id)
         store.audit.add(COMMAND_LINE, "revoked a rater", name)
         print(f"ended {count} links and sessions of {name}; the ratings stay")
+
+
+@rating.command
+def withdraw(number: Whole, /, *, reason: str, data_dir: DataDir = DATA) -> None:
+    """Take one rating back for its rater: nothing learns from it any more.
+
+    It stays in the data with the reason, as what was taken back.
+
+    Args:
+        number: Its id, as the export and the Data tab have it.
+        reason: Why, for whoever reads the data.
+    """
+    with open_store(data_dir, must_exist=True) as store:
+        try:
+            given = store.ratings.withdraw(number, reason)
+        except ValueError as error:
+            raise UserError(str(error)) from None
+        store.audit.add(COMMAND_LINE, "withdraw", f"rating {number}, reason {given.withdrawn}")
+    print(f"withdrew rating {number}: {given.rater} gave clip {given.clip} a {given.value}")
 
 
 def audit(*, csv: Path | None = None, data_dir: DataDir = DATA) -> None:

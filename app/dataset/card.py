@@ -13,6 +13,9 @@ from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SE
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
 
+_MOST_WITHDRAWN = 1000
+"""Withdrawn ratings of a run that are listed, the newest."""
+
 
 def card(store: Store, run: str | None = None, *, now: datetime | None = None) -> str:
     """The card of one run's ratings, or of all runs.
@@ -76,8 +79,18 @@ def _run(store: Store, entry: dict[str, Any]) -> str:
         f"### {_text(run)}\n\nDemonstration {_text(entry['demo'])} (SHA-256 "
         f"{_text(entry['demo_sha256'][:16])}…), seed {_text(entry['seed'])}, "
         f"made {_text(entry['created_at'])} with onedemo {_text(entry['version'])}.\n\n"
-        + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n"
+        + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n" + _withdrawn(store, run)
     )  # fmt: skip
+
+
+def _withdrawn(store: Store, run: str) -> str:
+    """What a researcher took back, and why; it is not among the ratings."""
+    rows = store.ratings.given(run, withdrawn=True, most=_MOST_WITHDRAWN)
+    if not rows:
+        return ""
+    heads = ("withdrawn rating", "clip", "rater", "value", "reason")
+    lines = (_line((row.event, row.clip, row.rater, row.value, row.withdrawn)) for row in rows[::-1])
+    return _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n"
 
 
 def _figures(figures: Quality) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from onedemo.storage.ratings import MOST_REASON
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 
@@ -34,6 +35,7 @@ class Actions:
         actions = {
             "exclude": self._exclude, "include": self._include, "open run": self._open,
             "new run": self._create, "pause run": self._pause, "resume run": self._resume,
+            "withdraw": self._withdraw,
         }  # fmt: skip
         if body["do"] not in actions:
             raise ValueError(f"there is no action {body['do'][:40]!r}")
@@ -47,6 +49,10 @@ class Actions:
 
     def _include(self, who: Rater, fields: dict[str, Any]) -> None:
         self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
+
+    def _withdraw(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"rating": int, "reason": str}, longest=MOST_REASON)
+        self._store.ratings.withdraw(fields["rating"], fields["reason"], by=who.id)
 
     def _open(self, who: Rater, fields: dict[str, Any]) -> None:
         _check(fields, {"run": str})
@@ -82,12 +88,9 @@ class Actions:
         return fields["rater"]
 
 
-def _check(fields: dict[str, Any], kinds: dict[str, type]) -> None:
+def _check(fields: dict[str, Any], kinds: dict[str, type], longest: int = 100) -> None:
     if set(fields) != set(kinds) or any(type(fields[name]) is not kind for name, kind in kinds.items()):
         raise ValueError(f"the action takes {', '.join(kinds) or 'no fields'}")
     for name, value in fields.items():
-        if isinstance(value, str) and not (len(value) <= _LONGEST and (value == "" or value.isprintable())):
-            raise ValueError(f"{name} is up to {_LONGEST} printable characters")
-
-
-_LONGEST = 100
+        if isinstance(value, str) and not (len(value) <= longest and (value == "" or value.isprintable())):
+            raise ValueError(f"{name} is up to {longest} printable characters")

@@ -125,6 +125,21 @@ class Downloads:
         html = await asyncio.to_thread(self._table, filters)
         return web.Response(text=html, content_type="text/html")
 
+    async def given(self, request: web.Request) -> web.StreamResponse:
+        """Ratings of a run one by one, newest first, to be looked at: JSON.
+
+        Query: ``run``; ``rater``, by name; ``before``, a rating's number.
+        """
+        run, rater, before = (request.query.get(name, "") for name in ("run", "rater", "before"))
+        if max(len(run), len(rater), 10 * len(before)) > 200 or (before and not before.isdecimal()):
+            raise web.HTTPBadRequest(text="Ratings are listed by run, rater and number.")
+        ratings, number = self._store.ratings, min(int(before), 2**53) if before else None
+        most = _SHOWN + 1
+        found = await asyncio.to_thread(ratings.given, run, rater=rater or None, before=number, most=most)
+        raters = sorted({name for name, _ in await asyncio.to_thread(ratings.tallies, run)})
+        rows = [rating._asdict() for rating in found[:_SHOWN]]
+        return web.json_response({"ratings": rows, "more": len(found) > _SHOWN, "raters": raters})
+
     def _table(self, filters: dict[str, Any]) -> str:
         rows = self._store.ratings.stream(**filters)
         shown = list(islice(rows, _SHOWN))

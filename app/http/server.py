@@ -158,6 +158,7 @@ class Front:
             Route("GET", "/export.zip", "researcher", downloads.everything, "downloaded everything"),
             Route("GET", "/card.md", "researcher", downloads.card, "downloaded the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
+            Route("GET", "/ratings", "researcher", downloads.given),
             Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),
         )
         return (

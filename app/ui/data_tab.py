@@ -38,7 +38,9 @@ class Data:
         gui = context.client.gui
         self._html = gui.add_html("")
         # Drawn once, so that nothing that is being filled in is lost.
-        gui.add_html(str(export_html(self._run, str(self._store.path.absolute()))))
+        clips = f"/clips/CLIP.jpg?v={context.version}"
+        path = str(self._store.path.absolute())
+        gui.add_html(str(export_html(self._run, path, clips, context.demo.fps)))
 
     def show(self) -> None:
         """Counts."""
@@ -104,6 +106,16 @@ def data_html(
     )  # fmt: skip
 
 
-def export_html(run: str, path: str) -> Markup:
-    """Filter, preview and download of a run's ratings, and the path of the file they are in."""
-    return render("data.html:export", run=run, query=f"?run={quote(run)}", path=path)
+def export_html(run: str, path: str, clips: str, fps: float) -> Markup:
+    """A run's ratings one by one; filter, preview and download; where they are.
+
+    Args:
+        run: Whose.
+        path: Of the file that they are in.
+        clips: Where pictures of clips are, CLIP in the place of the number.
+        fps: Of the clips.
+    """
+    return render(
+        "data.html:export", run=run, query=f"?run={quote(run)}", path=path, clips=clips, fps=fps,
+        answers=ANSWERS,
+    )  # fmt: skip

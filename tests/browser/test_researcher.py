@@ -244,3 +244,35 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site):
         page.keyboard.press("?")
         help = page.locator(".od-help:visible")
         assert "the left one is closer" in help.inner_text() and "mark" not in help.inner_text()
+
+
+def test_any_rating_is_looked_at_and_withdrawn_with_a_reason(chromium, site):
+    from onedemo.app.dataset.card import card
+
+    store, run = site.trainer.store, site.trainer.run
+    ids = [clip.id for clip in store.clips.waiting(run)]
+    for name in ("Ann", "Bob <i>"):
+        rater = store.accounts.ensure(name, "annotator").id
+        for clip, value in zip(ids, (5, 1, 4), strict=False):
+            store.ratings.rate(clip, rater, value, 900)
+    with opened(chromium, site.links["researcher"]) as page:
+        page.click('.od-tabs >> text="Data"')
+        rows = page.locator(".od-given tbody tr")
+        rows.first.wait_for()
+        assert rows.count() == 6 and page.locator(".od-given tbody i").count() == 0
+        page.select_option(".od-given select", "Ann")
+        until(lambda: page.wait_for_timeout(20) or rows.count() == 3)
+        page.click('.od-given tr:has(b:text-is("5")) >> text=Look')
+        review = page.locator(".od-review")
+        review.locator(".od-player[data-frame]").wait_for()
+        assert "Ann: 5, The same" in review.inner_text() and f"of clip {ids[0]}" in review.inner_text()
+        review.locator("input[name=reason]").fill("<b>pressed 5</b> by mistake")
+        review.locator("text=Withdraw").last.click()
+        page.wait_for_selector(".od-given tr >> text=Withdrawn by ada: <b>pressed 5</b> by mistake")
+        assert not review.is_visible() and store.ratings.count_for_training(run) == 5
+        page.locator(".od-given tr.od-left-out >> text=Look").click()
+        review.locator(".od-player[data-frame]").wait_for()
+        assert not review.locator("[data-withdraw]").is_visible()
+    said = [line for _, who, what, line in store.audit.lines() if (who, what) == ("ada", "withdraw")]
+    assert len(said) == 1 and "pressed 5" in said[0] and "rating 1" in said[0]
+    assert "| 1 | 1 | Ann | 5 | <b>pressed 5</b> by mistake |" in card(store, run)

@@ -31,7 +31,7 @@ LOOKED_BACK = 400
 _WITHDRAWN = ("withdrawn",) if max(STEPS) > 6 else ()
 """Column of ``events`` since schema 7: why a researcher took a rating back."""
 MOST_REASON = 200
-"""Characters of the reason for a skip."""
+"""Characters of the reason for a skip, or why a rating was withdrawn."""
 
 
 class Rating(NamedTuple):
@@ -77,6 +77,21 @@ class LastAnswer(NamedTuple):
     """None: it was skipped."""
     mark: tuple[int, int] | None
     """As ``RatedSegment.mark``."""
+
+
+class Given(NamedTuple):
+    """A rating that holds, or that a researcher withdrew."""
+
+    event: int
+    clip: int
+    rater: str
+    value: int
+    repeat: bool
+    created_at: str
+    withdrawn: str | None
+    """Why it was withdrawn; None: it holds."""
+    by: str | None
+    """Who withdrew it; None: the command line, or it holds."""
 
 
 class AlreadyAnswered(ValueError):
@@ -134,6 +149,72 @@ class Ratings:
             ValueError: If there is nothing to take back.
         """
         return self._event(clip_id, rater_id, "undo", None, 0, repeat=repeat)
+
+    def withdraw(self, event: int, reason: str, *, by: int | None = None) -> Given:
+        """Takes any one rating back, later and for its rater: nothing learns from it from now on.
+
+        One more event, an undo with the reason. A clip that nobody else has answered is not asked again.
+
+        Args:
+            event: Number of the rating.
+            reason: Why, 1 to 200 printable characters.
+            by: The researcher; None: at the command line.
+
+        Returns:
+            The rating.
+
+        Raises:
+            ValueError: If there is no such rating, it does not hold any more, or the reason is none.
+        """
+        reason = reason.strip()
+        if not 1 <= len(reason) <= MOST_REASON or not reason.isprintable():
+            raise ValueError(f"a reason is one line of 1 to {MOST_REASON} characters")
+        with self._database.transaction() as db:
+            row = db.execute(
+                "SELECT e.clip_id, e.rater_id, p.name, e.value, e.repeat, e.created_at, EXISTS ("
+                "  SELECT 1 FROM events l WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id"
+                "  AND l.repeat = e.repeat AND l.id > e.id)"
+                " FROM events e JOIN raters p ON p.id = e.rater_id WHERE e.id = ? AND e.kind = 'rate'",
+                (event,),
+            ).fetchone()
+            if row is None:
+                raise ValueError(f"there is no rating {event}")
+            clip, rater, name, value, repeat, created_at, over = row
+            if over:
+                raise ValueError(f"rating {event} does not hold any more: it was taken back before")
+            db.execute(
+                "INSERT INTO events (clip_id, rater_id, kind, repeat, withdrawn, by_id, snapshot, predicted,"
+                " latency_ms, created_at) SELECT id, ?, 'undo', ?, ?, ?, snapshot, predicted, 0, ?"
+                " FROM clips WHERE id = ?",
+                (rater, repeat, reason, by, now(), clip),
+            )
+            db.execute("UPDATE clips SET state = 'withdrawn' WHERE id = ? AND answers = 0", (clip,))
+        return Given(event, clip, name, value, bool(repeat), created_at, reason, None)
+
+    def given(
+        self, run: str, *, rater: str | None = None, before: int | None = None, most: int = 50,
+        withdrawn: bool = False,
+    ) -> list[Given]:  # fmt: skip
+        """Ratings of a run that hold or were withdrawn, newest first.
+
+        Args:
+            run: Of which.
+            rater: Name; None: of everybody.
+            before: Those with smaller numbers alone.
+            most: How many at most.
+            withdrawn: Those that were withdrawn alone.
+        """
+        rows = self._database.rows(
+            "SELECT e.id, e.clip_id, p.name, e.value, e.repeat, e.created_at, w.withdrawn, b.name"
+            " FROM events e JOIN clips c ON c.id = e.clip_id JOIN raters p ON p.id = e.rater_id"
+            " LEFT JOIN events w ON w.id = (SELECT MIN(l.id) FROM events l WHERE l.clip_id = e.clip_id"
+            "  AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id)"
+            " LEFT JOIN raters b ON b.id = w.by_id"
+            " WHERE e.kind = 'rate' AND c.run = ?1 AND (?2 IS NULL OR p.name = ?2) AND e.id < ?3"
+            " AND (w.withdrawn IS NOT NULL OR (w.id IS NULL AND NOT ?4)) ORDER BY e.id DESC LIMIT ?5",
+            (run, rater, before if before is not None else 2**62, withdrawn, most),
+        )
+        return [Given(*row[:4], bool(row[4]), *row[5:]) for row in rows]
 
     def _event(
         self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int, *,

@@ -262,6 +262,10 @@ STEPS: dict[int, str] = {
             WHERE l.clip_id = e.clip_id AND l.rater_id = e.rater_id AND l.repeat = e.repeat AND l.id > e.id
         );
     """,
+    # 7: a rating that a researcher took back later is an undo with the reason; by_id says who it was.
+    7: """
+    ALTER TABLE events ADD COLUMN withdrawn TEXT CHECK (withdrawn IS NULL OR kind = 'undo');
+    """,
 }
 
 

@@ -6,7 +6,9 @@ import socket
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
+import numpy as np
 import pytest
 
 from helpers.paths import ROOT
@@ -24,6 +26,7 @@ from onedemo.storage.store import Store
     ("arguments", "sentence"),
     [
         ("serve --demo hoper-backflip", "did you mean hopper-backflip?"),
+        ("serve --host [::1] --demo hoper-backflip", "did you mean hopper-backflip?"),  # no other machine
         ("serve --encoder resnet", "no encoder 'resnet'; choose efficientnet-lite0 or vgg16"),
         ("serve --prt 99", "unknown option --prt; did you mean --port?"),
         ("serve --port 99999", "must be a whole number from 0 to 65535"),
@@ -109,6 +112,27 @@ def test_raters_get_links_and_lose_them(tmp_path, capsys):
     assert "no run 'nope'; there are: none" in capsys.readouterr().err
     assert main(["export", "--out", str(tmp_path / "onedemo.sqlite3"), *where]) == 2
     assert "is the database" in capsys.readouterr().err
+
+
+def test_a_rating_is_withdrawn(tmp_path, capsys):
+    from onedemo.storage.clips import NewClip
+    from onedemo.types import Segment
+
+    sizes = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
+    segment = Segment(**{name: np.zeros((4, size)) for name, size in sizes.items()})
+    with closing(Store(tmp_path)) as store:
+        store.runs.add(run="r", demo="d", demo_sha256="0" * 64, seed=0, config="", version="0")
+        new = NewClip(demo_step=0, segment=segment, stage="pretrain", iteration=0)
+        (clip,) = store.clips.add("r", [new])
+        number = store.ratings.rate(clip.id, store.accounts.ensure("Ann", "annotator").id, 4, 900)
+    command = ["rating", "withdraw", str(number), "--reason", "pressed by mistake"]
+    command += ["--data-dir", str(tmp_path)]
+    assert main(command) == 0
+    assert capsys.readouterr().out == f"withdrew rating {number}: Ann gave clip {clip.id} a 4\n"
+    assert main(command) == 2
+    assert "does not hold any more" in capsys.readouterr().err
+    assert main(["audit", "--data-dir", str(tmp_path)]) == 0
+    assert f"withdraw: rating {number}, reason pressed by mistake" in capsys.readouterr().out
 
 
 def test_help_is_quick_and_loads_nothing_heavy():

@@ -292,6 +292,39 @@ def test_a_second_opinion_stands_beside_the_first_and_is_not_learned_from(store,
     ]  # fmt: skip
 
 
+def test_any_rating_is_withdrawn_with_a_reason_and_nothing_learns_from_it(store, clips, ann):
+    ada, bob = store.accounts.ensure("Ada", "researcher"), store.accounts.ensure("Bob", "annotator")
+    first, others = store.ratings.rate(clips[0].id, ann.id, 5, 900), clips[1].id
+    store.ratings.rate(others, ann.id, 2, 900)
+    shared = store.ratings.rate(others, bob.id, 4, 900)
+    second = store.ratings.rate(clips[2].id, ann.id, 3, 900)
+    before = store.ratings.last_event()
+    withdrawn = store.ratings.withdraw(first, " fell asleep ", by=ada.id)
+    assert withdrawn[:4] == (first, clips[0].id, "Ann", 5)
+    store.ratings.withdraw(shared, "another browser")
+    held = [rating.event for rating in store.ratings.for_training("r")]
+    assert first not in held and shared not in held and len(held) == 2
+    assert len(store.ratings.for_training("r", before)) == 4  # what was fitted then can be fitted again
+    assert store.ratings.by_class("r") == [0, 1, 1, 0, 0] and store.ratings.count_for_training("r") == 2
+    assert [row[0] for row in store.ratings.stream()] == held
+    # Nobody is asked that clip again; one that somebody else has rated stays.
+    assert clips[0].id not in [clip.id for clip in store.clips.waiting("r")]
+    assert store.ratings.last_answer("r", ann.id).clip == clips[2].id
+    listed = store.ratings.given("r")
+    assert [row.event for row in listed] == [second, shared, second - 2, first]
+    assert (listed[3].withdrawn, listed[3].by) == ("fell asleep", "Ada") and listed[0].withdrawn is None
+    assert [row.event for row in store.ratings.given("r", rater="Ann", before=second)] == [second - 2, first]
+    assert store.ratings.given("r", withdrawn=True) == [listed[1], listed[3]]
+    for event, reason, words in (
+        (first, "again", "does not hold any more"), (10**6, "x", "there is no rating"),
+        (before + 1, "an undo", "there is no rating"), (second, "  ", "a reason is one line"),
+        (second, "a\nb", "a reason is one line"), (second, "x" * 201, "a reason is one line"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            store.ratings.withdraw(event, reason)
+    assert store.ratings.last_event() == before + 2
+
+
 def test_a_rater_is_left_out_and_taken_in_again_and_every_event_can_be_gone_back_to(store, clips, ann):
     bob, ada = store.accounts.ensure("Bob", "annotator"), store.accounts.ensure("Ada", "researcher")
     mine = store.ratings.rate(clips[0].id, ann.id, 2, 900)
