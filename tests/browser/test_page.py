@@ -35,7 +35,7 @@ def opened(chromium, link: str, viewport=DESKTOP, **options: Any) -> Iterator[An
     page = _left.pop() if _left and not options else chromium.new_context(**options).new_page()
     page.set_viewport_size(viewport)
     page.goto(link)
-    page.wait_for_selector(".od-header", timeout=30_000)
+    page.wait_for_selector(".od-header", timeout=90_000)
     kept = False
     try:
         yield page
