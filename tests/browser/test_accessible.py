@@ -14,7 +14,7 @@ OURS = {"include": [["[class^='od-']"]]}
 
 def assert_nothing_serious(page, where: str) -> None:
     # Colours on their way from one scheme to the other have any contrast.
-    page.wait_for_timeout(300)
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     page.wait_for_function(
         "() => document.getAnimations().every(a => a.playState !== 'running'"
         " || a.effect.getComputedTiming().endTime === Infinity)"

@@ -10,7 +10,7 @@ from contextlib import closing
 
 import pytest
 
-from browser.test_page import SMALL, drag_slider, opened, shown_clip, until
+from browser.test_page import drag_slider, opened, shown_clip, until
 from helpers.server_process import Serving
 from helpers.stick_figure import backflip_video
 from onedemo.app.cli.main import main
@@ -29,6 +29,8 @@ SETTINGS = {
     "practice.random_lanes": 8,
     "practice.bank_tries": 500,
 }
+TINY = {"width": 700, "height": 500}
+"""The live robot is drawn 30 times a second."""
 BRIEF = ["--set", "rollouts.total_steps=12000"]
 """Three iterations: a run that goes on for ever takes a core from the browser."""
 QUICK = ["--port", "0", *(word for key, value in SETTINGS.items() for word in ("--set", f"{key}={value}"))]
@@ -75,7 +77,7 @@ def rate(page, data_dir, value, how="key"):
     return clip, value
 
 
-def rate_five_and_look(chromium, serving, tmp_path, *options):
+def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
     data_dir = serving.data_dir
     _, links, log = serving.start(*QUICK, *BRIEF, *options)
     assert links, log.read_text()
@@ -85,19 +87,19 @@ def rate_five_and_look(chromium, serving, tmp_path, *options):
         expected = [rate(page, data_dir, value, how) for value, how in ways]
     assert rows(data_dir) == expected
     until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 60)
-    with opened(chromium, links["researcher"], SMALL) as page:
+    with opened(chromium, links["researcher"], TINY) as page:
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
         where = page.locator("canvas[data-engine]").bounding_box()
         seen: set[bytes] = set()  # empty, drawn, and moving
         until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 60)
         page.click('.od-tabs >> text="Data"')
+        page.wait_for_selector(f".od-data >> text=method {method}")
         with page.expect_download() as download:
             page.click("text=Download CSV")
         download.value.save_as(tmp_path / "ratings.csv")
     with (tmp_path / "ratings.csv").open(newline="") as file:
         downloaded = [(int(row["clip_id"]), int(row["value"])) for row in csv.DictReader(file)]
     assert downloaded == expected
-    return links, expected
 
 
 def test_ratings_teach_another_body_filmed_by_anybody(chromium, serving, tmp_path):
@@ -108,10 +110,7 @@ def test_ratings_teach_another_body_filmed_by_anybody(chromium, serving, tmp_pat
 
 
 def test_ratings_teach_the_papers_method(chromium, serving, tmp_path):
-    links, _ = rate_five_and_look(chromium, serving, tmp_path, "--method", "paper")
-    with opened(chromium, links["researcher"], SMALL) as page:
-        page.click('.od-tabs >> text="Data"')
-        page.wait_for_selector(".od-data >> text=method paper")
+    rate_five_and_look(chromium, serving, tmp_path, "--method", "paper", method="paper")
 
 
 def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):

@@ -16,8 +16,6 @@ from onedemo.experiments.speed.figures import Result, Skipped, single
 PEOPLE = 50
 EVERY_S = 4.0
 SECONDS = 180.0
-_SETTLE_S = 5.0
-"""Seconds that all pages are open before memory is read for the first time."""
 
 
 def measure(quick: bool) -> list[Result]:
@@ -37,7 +35,9 @@ async def _measure(data_dir: Path, seconds: float) -> list[Result]:
         return await crowd(study, people=PEOPLE, every_s=EVERY_S, seconds=seconds)
 
 
-async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) -> list[Result]:
+async def crowd(
+    study: Stocked, *, people: int, every_s: float, seconds: float, settle_s: float = 5.0
+) -> list[Result]:
     """People who all rate at a steady pace while the robot practises.
 
     Args:
@@ -45,13 +45,14 @@ async def crowd(study: Stocked, *, people: int, every_s: float, seconds: float) 
         people: How many.
         every_s: Seconds from press to press of each.
         seconds: How long.
+        settle_s: Seconds that all pages are open before memory is read for the first time.
 
     Raises:
         RuntimeError: If a rating was lost or doubled, or practice stood still.
     """
     await bring(study.session, study.server, "online")
     await study.open(people)
-    await asyncio.sleep(_SETTLE_S)
+    await asyncio.sleep(settle_s)
     before, start, began = study.iterations(), study.server.resident_mib(), time.monotonic()
     taken = await study.rate(every_s, seconds)
     pace = len(taken) / (time.monotonic() - began)

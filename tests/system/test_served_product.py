@@ -34,7 +34,7 @@ def test_presses_are_timed_until_the_next_clip_is_there_and_painted(data_dir, ch
         async with stocked(data_dir, people=5, settings=QUICK) as study:
             return (
                 await product.press_times(study, turns=1, seconds=2.0, every_s={1: 0.5, 4: 1.0}),
-                await crowd.crowd(study, people=5, every_s=0.5, seconds=2.0),
+                await crowd.crowd(study, people=5, every_s=0.5, seconds=2.0, settle_s=0.5),
                 await painted.press_to_paint(study, turns=1, presses=4),
             )
 

@@ -361,7 +361,7 @@ def test_clips_for_people_are_chosen_a_few_at_a_time(store, demo):
     wait_for(lambda: trainer_.status().phase == "pretrain" and len(store.clips.waiting("r", "cut")) == 12)
     for clip in store.clips.waiting("r", "cut")[:3]:
         store.ratings.rate(clip.id, ann.id, 3, latency_ms=5)
-    time.sleep(1.0)
+    time.sleep(0.5)  # it has looked twice
     assert len(store.clips.waiting("r", "cut")) == 9
     store.ratings.rate(store.clips.waiting("r", "cut")[0].id, ann.id, 3, latency_ms=5)
     wait_for(lambda: len(store.clips.waiting("r", "cut")) == 12)

@@ -80,7 +80,7 @@ def full_states(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
 
 def measure(quick: bool = False) -> list[Result]:
     """Our batched Hopper against bare MuJoCo, envpool and gymnasium, and the rate for 1 to 512 lanes."""
-    turns, steps = (9, 40) if quick else (25, 125)
+    turns, steps = (5, 40) if quick else (25, 125)
     return [
         *_against_bare(turns, steps),
         *_against_envpool(turns, steps),

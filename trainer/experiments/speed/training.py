@@ -30,7 +30,7 @@ _FRAMES, _FPS = 240, 30.0
 def measure(quick: bool = False) -> list[Result]:
     """Training beside bare physics, and the learned reward's share of it."""
     with one_thread():
-        return _against_physics(5 if quick else 25)
+        return _against_physics(3 if quick else 25)
 
 
 @contextmanager
