@@ -39,8 +39,9 @@ chaos: .venv/.installed-test
 	@mkdir -p promises
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
+	PYTHONPATH=tests $(BIN)/python tests/load/attack_http.py --json promises/attack.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
-	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json
+	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json promises/attack.json
 
 soak: .venv/.installed-test
 	@mkdir -p promises

@@ -204,7 +204,8 @@ class Ratings:
     def last_answer(self, run: str, rater_id: int) -> LastAnswer | None:
         """The rating or skip that a rater gave last in a run, of those that hold; None if there is none.
 
-        Only among the rater's last 400 events, and only of clips that can be shown again: those of an import have no picture.
+        Only among the rater's last 400 events, and only of clips that can be shown again: those of an import
+        have no picture.
         """
         rows = self._database.rows(
             "SELECT e.clip_id, e.repeat, e.value, e.mark_from, e.mark_to FROM events e"
