@@ -41,12 +41,13 @@ chaos: .venv/.installed-test
 	  tests/browser/test_line.py
 	$(BIN)/python tests/data/videos.py --long
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
+	PYTHONPATH=tests $(BIN)/python tests/load/attack_http.py --json promises/attack.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
 	PYTHONPATH=tests $(BIN)/python tests/load/hostile_archives.py --json promises/archives.json
 	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 120 --films 8 --json promises/films.json
 	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 1200 --json promises/drawn.json
 	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json \
-	  promises/archives.json promises/films.json promises/drawn.json
+	  promises/attack.json promises/archives.json promises/films.json promises/drawn.json
 
 soak: .venv/.installed-test
 	@mkdir -p promises

@@ -18,7 +18,10 @@ DataDir = Annotated[Path, Parameter(help="Where everything is kept.")]
 
 
 def _whole(kind: Any, tokens: Sequence[Token]) -> int:
-    return int(tokens[0].value)  # cyclopts would round 1.5
+    number = int(tokens[0].value)  # cyclopts would round 1.5
+    if abs(number) >= 2**63:  # nothing that takes a number takes a larger one
+        raise ValueError(number)
+    return number
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]

@@ -38,7 +38,7 @@ class Data:
         gui = context.client.gui
         self._html = gui.add_html("")
         # Drawn once, so that nothing that is being filled in is lost.
-        clips = f"/clips/CLIP.jpg?v={context.version}"
+        clips = f"clips/CLIP.jpg?v={context.version}"
         path = str(self._store.path.absolute())
         gui.add_html(str(export_html(self._run, path, clips, context.demo.fps)))
 

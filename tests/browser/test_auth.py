@@ -102,6 +102,7 @@ def test_the_page_can_be_served_encrypted(site, tmp_path):
         link = site.links["annotator"].removeprefix(site.url)
         status, headers, _ = ask(url, link, ssl=trusted)
         assert status == 303 and "Secure" in headers["Set-Cookie"]
+        assert headers["Strict-Transport-Security"] == "max-age=31536000"
         with pytest.raises(aiohttp.ClientError):
             ask(url.replace("https", "http"))
     finally:
@@ -114,12 +115,13 @@ def test_a_proxy_is_believed_only_where_there_is_one(site):
 
     asked = {"X-Forwarded-For": "6.6.6.6, 10.0.0.9", "X-Forwarded-Proto": "https"}
     link = site.links["annotator"].removeprefix(site.url)
-    assert "Secure" not in ask(site.url, link, headers=asked)[1]["Set-Cookie"]
+    plain = ask(site.url, link, headers=asked)[1]
+    assert "Secure" not in plain["Set-Cookie"] and "Strict-Transport-Security" not in plain
     front = Front(site.page, Listening(port=0, behind_proxy=True))
     url = front.start()
     try:
         assert "Secure" in ask(url, link, headers=asked)[1]["Set-Cookie"]
-        ask(url, "/login?token=wrong", headers=asked)
+        assert "Strict-Transport-Security" in ask(url, "/login?token=wrong", headers=asked)[1]
     finally:
         front.close()
     ask(site.url, "/login?token=wrong", headers=asked)

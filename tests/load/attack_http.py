@@ -4,7 +4,8 @@
 
 Prints a table: latency of the health check, of a rating until its next clip, ratings a second, how long a new
 page takes to open, what the log grew. Ends with exit status 1 if a promise is broken: an answer to the health
-check within 2 s, a next clip within 5 s, a page within 20 s, 1 MB of log at most, no rating lost or doubled.
+check within 2 s, a next clip within 5 s, a page within 20 s, 1 MB of log at most, an end within 10 s of
+SIGTERM, no rating lost or doubled.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AsyncExitStack, ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,16 +36,19 @@ SETTINGS = (
 )  # fmt: skip
 """Clips are drawn for as long as it lasts."""
 MOST = {"health_max_s": 2.0, "next_clip_max_s": 5.0, "page_s": 20.0, "log_mb": 1.0}
+END_S = 10.0
 _PATIENCE_S = 60.0
 
 
 @dataclass
 class Site:
-    """What is attacked."""
+    """What is attacked, and rated at."""
 
     base: str
     data_dir: Path
     log: Path
+    end_s: float = 0.0
+    """From SIGTERM to the end of the process."""
 
     @property
     def port(self) -> int:
@@ -77,10 +81,10 @@ class Seen:
             "log_mb": self.log_mb,
         }
 
-    def broken(self) -> list[str]:
-        """The promises that were."""
-        figures = self.figures()
-        too_much = [f"{self.kind}: {name} {figures[name]:.2f}" for name in MOST if figures[name] > MOST[name]]
+    def broken(self, slack: float) -> list[str]:
+        """The promises that were, on a machine that is so much slower."""
+        figures, most = self.figures(), {name: slack * value for name, value in MOST.items()}
+        too_much = [f"{self.kind}: {name} {figures[name]:.2f}" for name in most if figures[name] > most[name]]
         return too_much + [f"{self.kind}: {note}" for note in self.notes]
 
 
@@ -94,23 +98,27 @@ def real_server(data_dir: Path, descriptors: int) -> Iterator[Site]:
     with ExitStack() as stack:
         errors = stack.enter_context(log.open("w"))
         child = subprocess.Popen(limited, stdout=subprocess.PIPE, stderr=errors, text=True)
-        stack.callback(end, child)
+        site = Site("", data_dir, log)
+        stack.callback(end, child, site)
         assert child.stdout is not None
         stack.callback(child.stdout.close)
         links = [child.stdout.readline().partition(": ")[2].strip() for _ in range(2)]
         if not links[1]:
             raise RuntimeError(f"onedemo serve did not start: {log.read_text()}")
-        yield Site(links[1].split("/login")[0], data_dir, log)
+        site.base = links[1].split("/login")[0]
+        yield site
 
 
-def end(child: subprocess.Popen) -> None:
-    """As the command ``kill``; by force if that takes half a minute."""
+def end(child: subprocess.Popen, site: Site) -> None:
+    """As the command ``kill``; by force if that takes a minute."""
+    began = time.monotonic()
     child.terminate()
     try:
-        child.wait(30)
+        child.wait(60)
     except subprocess.TimeoutExpired:
         child.kill()
         child.wait()
+    site.end_s = time.monotonic() - began
 
 
 def link_of(site: Site, name: str) -> str:
@@ -197,18 +205,26 @@ async def under(kind: str, site: Site, connections: int, seconds: float, given: 
 
 
 async def attacked(
-    site: Site, kinds: list[str], connections: int, seconds: float
+    site: Site, kinds: Sequence[str], connections: int, seconds: float, *, slack: float = 1.0
 ) -> tuple[list[Seen], list[str]]:
-    """What is seen without an attack and during each; and the promises that were broken."""
+    """What is seen without an attack and during each; and the promises that were broken.
+
+    Args:
+        site: A server at which nobody else rates.
+        kinds: Of ``attackers.KINDS``.
+        connections: At once, of the attacks that hold them.
+        seconds: Of each attack.
+        slack: Times as long as promised may everything take.
+    """
     given: Counter[tuple[int, int]] = Counter()
     found = [await under(kind, site, connections, seconds, given) for kind in ("", *kinds)]
     with closing(Store(site.data_dir)) as store:
         kept = Counter(store.database.rows("SELECT clip_id, value FROM events WHERE kind = 'rate'"))
-    broken = [note for seen in found for note in seen.broken()]
-    if given - kept:
-        broken.append(f"ratings lost: {dict(given - kept)}")
-    if any(count > 1 for count in kept.values()):
-        broken.append("ratings doubled")
+    broken = [note for seen in found for note in seen.broken(slack)]
+    if lost := given - kept:
+        broken.append(f"{lost.total()} ratings were lost")
+    if doubled := kept - Counter(set(kept)):
+        broken.append(f"{doubled.total()} ratings were doubled")
     return found, broken
 
 
@@ -241,11 +257,18 @@ def main() -> int:
         with real_server(Path(place) / "data", arguments.descriptors) as site:
             kinds = arguments.kinds or list(attackers.KINDS)
             found, broken = asyncio.run(attacked(site, kinds, 2 * arguments.descriptors, arguments.seconds))
+    if site.end_s > END_S:
+        broken.append(f"the server ended {site.end_s:.1f} s after SIGTERM")
     print(table(found))
+    print(f"\n{arguments.descriptors} descriptors; it ended {site.end_s:.1f} s after SIGTERM")
     for note in broken:
         print("BROKEN", note)
     if arguments.json is not None:
-        told = {"attacks": [{"kind": seen.kind} | seen.figures() for seen in found], "broken": broken}
+        told = {
+            "end_s": site.end_s,
+            "attacks": [{"kind": seen.kind} | seen.figures() for seen in found],
+            "broken": broken,
+        }
         arguments.json.write_text(json.dumps(told, indent=1) + "\n")
     return bool(broken)
 

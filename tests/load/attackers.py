@@ -22,9 +22,8 @@ _AGAIN_S = 1.0
 """How soon a connection that was ended is opened anew."""
 _HOST = "Host: 127.0.0.1\r\n"
 _FORM = (
-    "POST /login HTTP/1.1\r\nOrigin: http://127.0.0.1\r\n"
-    + _HOST
-    + "Content-Type: application/x-www-form-urlencoded"
+    f"POST /login HTTP/1.1\r\n{_HOST}Origin: http://127.0.0.1\r\n"
+    "Content-Type: application/x-www-form-urlencoded"
 )
 
 

@@ -1,6 +1,6 @@
 """A table of what the long checks found.
 
-``python tests/load/promises.py OUT.md kill.json door.json soak.json``.
+``python tests/load/promises.py OUT.md kill.json door.json attack.json soak.json``.
 
 Files that are missing are left out. Each check writes its figures with ``--json``.
 """
@@ -48,6 +48,15 @@ def rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     if "hostile archives" in found:
         said = f"{found['hostile archives']}, the slowest in {found['slowest, s']:.1f} s"
         return [("hostile archives refused", said), ("of them broken through", f"{len(found['broken'])}")]
+    if "attacks" in found:
+        return [
+            (
+                f"under attack: {seen['kind']}",
+                f"health {seen['health_max_s']:.2f} s, next clip {seen['next_clip_max_s']:.1f} s at most, "
+                f"{seen['ratings_per_s']:.1f} ratings a second, a new page {seen['page_s']:.1f} s",
+            )
+            for seen in found["attacks"]
+        ] + [("promises broken by them", f"{len(found['broken'])}")]
     videos = found["videos refused"] + found["videos taken"]
     return [
         ("messages fuzzed", f"{found['messages']:,}"),

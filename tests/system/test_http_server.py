@@ -161,6 +161,17 @@ def test_login_page_its_style_and_health_are_public_and_tell_nothing(site):
     assert status == 503 and b'"ok": false' in body
 
 
+def test_no_answer_tells_a_version_in_its_headers(site):
+    told = [
+        fetch(site.url, path, link=site.links["researcher"])[1]
+        for path in ("/login", "/x", "/clips/1.jpg", "/export.csv", "/static/page.css", "/r/1")
+    ] + [fetch(site.url, "/x", headers={"Expect": "x"})[1]]
+    for headers in told:
+        assert headers["Server"] == "onedemo"
+        assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
+        assert not any("aiohttp" in value or "Python" in value for value in headers.values())
+
+
 def test_link_becomes_a_cookie_that_scripts_cannot_read(site):
     status, headers, _, _ = fetch(site.url, site.links["annotator"].removeprefix(site.url), follow=False)
     assert (status, headers["Location"]) == (303, "/r/2/")

@@ -8,8 +8,9 @@ import sys
 
 import pytest
 
+from helpers.beside_playwright import run
 from helpers.paths import ROOT, TESTS
-from load import fuzz_http
+from load import attack_http, attackers, fuzz_http
 
 
 @pytest.mark.seam
@@ -25,6 +26,17 @@ def test_hostile_input_changes_nothing(tmp_path):
     assert found["requests"] == fuzz_http.QUICK["requests"]
     assert found["sockets refused"] == 4 * fuzz_http.PAGES_AT_ONCE
     assert found["answers 4xx"] > 50
+
+
+@pytest.mark.seam
+def test_somebody_rates_while_strangers_attack(site):
+    """Briefly, and with much patience: tests/load/attack_http.py, of ``make chaos``, measures."""
+    site.trainer.add_clips(60)
+    attacked = attack_http.Site(site.url, site.trainer.data_dir, site.trainer.store.path)
+    found, broken = run(attack_http.attacked(attacked, list(attackers.KINDS), 200, 0.5, slack=8))
+    assert not broken, attack_http.table(found)
+    assert len(found) == 1 + len(attackers.KINDS)
+    assert all(seen.next_clip_s and seen.health_s for seen in found)
 
 
 def test_every_threat_names_a_test_that_exists():

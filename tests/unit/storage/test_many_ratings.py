@@ -48,7 +48,7 @@ def test_the_page_and_a_press_cost_the_same_with_forty_times_the_ratings(store):
 
 
 def test_what_an_open_page_asks_twice_a_second_costs_little_in_another_run_too(store):
-    """A rater who has rated much in one run has nothing to take back in the next: all was looked at."""
+    """A rater who has rated much in one run has nothing to take back in the next, after a short look."""
 
     def ask():
         assert store.ratings.last_answer("next", 1) is None
