@@ -30,10 +30,9 @@ from contextlib import closing, contextmanager, redirect_stderr
 from pathlib import Path
 
 import aiohttp
-import cv2
 import msgspec
-import numpy as np
 import viser
+from data.videos import KINDS
 
 from helpers.fake_trainer import StandIn
 from onedemo.app.annotation.assignment import Again
@@ -44,7 +43,6 @@ from onedemo.app.services.demo_images import Pictures
 from onedemo.app.ui.app import Page
 from onedemo.demos.library import import_video
 from onedemo.demos.sandboxed_decoder import Limits
-from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 
 FULL = {"messages": 100_000, "requests": 10_000, "videos": 500}
@@ -415,23 +413,23 @@ async def send_requests(port: int, cookie: str, rng: random.Random, count: int, 
         await asyncio.gather(*(one(hostile_request(rng, cookie, own)) for _ in range(min(8, count - start))))
 
 
+_MUTATED = {
+    "h264.mp4", "hevc.mp4", "av1.webm", "vp9.webm", "mpeg4.avi", "mjpeg.avi", "interlaced.ts", "mpeg2.mxf",
+    "h264.flv", "fast.gif", "delays.apng", "delays.webp", "prores.mov", "raw.y4m", "vp9.ivf", "wmv2.wmv",
+}  # fmt: skip
+
+
 def add_videos(directory: Path, rng: random.Random, count: int, findings: Findings) -> None:
     """Brings mutated videos in: each becomes a demo or is refused in one sentence."""
     directory.mkdir()
-    frames = [np.full((48, 64, 3), 20 * i, np.uint8) for i in range(12)]
-    originals = {".webm": directory / "a.webm", ".avi": directory / "a.avi", ".mp4": directory / "a.mp4"}
-    write_webm(originals[".webm"], frames, fps=30)
-    for suffix, code in ((".avi", "MJPG"), (".mp4", "mp4v")):
-        writer = cv2.VideoWriter(
-            str(originals[suffix]), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*code), 30, (64, 48)
-        )
-        for frame in frames:
-            writer.write(frame)
-        writer.release()
+    originals = {kind.file: directory / kind.file for kind in KINDS if kind.file in _MUTATED}
+    for kind in KINDS:
+        if kind.file in originals:
+            kind.make(originals[kind.file])
     jobs = []
     for number in range(count):
-        suffix = rng.choice(list(originals))
-        jobs.append((number, suffix, mutated(rng, originals[suffix].read_bytes())))
+        file = rng.choice(list(originals))
+        jobs.append((number, Path(file).suffix, mutated(rng, originals[file].read_bytes())))
 
     def one(job: tuple[int, str, bytes]) -> None:
         number, suffix, data = job
