@@ -10,7 +10,6 @@ import asyncio
 import logging
 import re
 import sqlite3
-import time
 from typing import Protocol
 
 from aiohttp import (
@@ -53,8 +52,6 @@ _CLOSE_S = 2.0
 """What a browser has to answer that its page is closed."""
 _LOOK_S = 1.0
 """How soon a page is closed whose session has ended."""
-_NOTE_USE_S = 600.0
-"""How often it is noted that a session is in use."""
 _FOLLOWED_S = 20.0
 """Within this time a page opens its socket."""
 _MOST_WARNINGS = 20
@@ -184,19 +181,15 @@ class Proxy:
 
     async def _end_sessions(self) -> None:
         """Closes pages whose session was revoked, signed out or has expired; notes use of the others."""
-        noted: dict[str, float] = {}
         while True:
             await asyncio.sleep(_LOOK_S)
-            sessions, now = set(self._sockets.values()), time.monotonic()
-            noted = {session: at for session, at in noted.items() if at > now - _NOTE_USE_S}
+            sessions = set(self._sockets.values())
+            self._store.accounts.note_use(sessions)
             try:
                 ended = await asyncio.to_thread(self._store.accounts.ended_sessions, sessions)
-                if used := sessions - ended - noted.keys():
-                    await asyncio.to_thread(self._store.accounts.note_use, used)
                 await asyncio.to_thread(self._store.audit.finish)
             except sqlite3.Error:  # locked, say: it is looked at again
                 continue
-            noted |= dict.fromkeys(used, now)
             for browser, session in tuple(self._sockets.items()):
                 if session in ended:
                     await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this session has ended")

@@ -51,6 +51,8 @@ class Accounts:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._used: dict[str, str] = {}
+        """When each session was last seen in use, by its hash."""
 
     def ensure(self, name: str, role: str) -> Rater:
         """The rater of that name, made if there is none.
@@ -145,12 +147,17 @@ class Accounts:
             " AND MIN(expires_at, COALESCE(revoked_at, expires_at)) <= ?",
             (_in(-timedelta(days=_ENDED_DAYS)),),
         )
-        db.execute(
-            "DELETE FROM tokens WHERE id IN ("
-            " SELECT id FROM tokens WHERE rater_id = ? AND kind = 'session' AND link_id = ?"
-            " ORDER BY COALESCE(last_used_at, created_at) DESC, id DESC LIMIT -1 OFFSET ?)",
-            (link.rater.id, link.id, MOST_SESSIONS),
-        )
+        rows = db.execute(
+            "SELECT id, hash, last_used_at FROM tokens"
+            " WHERE rater_id = ? AND kind = 'session' AND link_id = ? ORDER BY id",
+            (link.rater.id, link.id),
+        ).fetchall()
+        if len(rows) > MOST_SESSIONS:
+            rows.sort(key=lambda row: max(self._used.get(row[1], ""), row[2] or ""))
+            gone = rows[:-MOST_SESSIONS]
+            db.executemany("DELETE FROM tokens WHERE id = ?", [row[:1] for row in gone])
+            for row in gone:
+                self._used.pop(row[1], None)
 
     def session_state(self, session_hash: str) -> Literal["open", "expired", "revoked"] | None:
         """What has become of a session; None if it is not known, such as one that was signed out."""
@@ -166,12 +173,11 @@ class Accounts:
             db.execute("DELETE FROM tokens WHERE hash = ? AND kind = 'session'", (session_hash,))
 
     def note_use(self, session_hashes: Iterable[str]) -> None:
-        """Notes that these sessions are in use, so that others of their links end before them."""
-        with self._database.transaction() as db:
-            db.executemany(
-                "UPDATE tokens SET last_used_at = ? WHERE hash = ? AND kind = 'session'",
-                [(now(), session) for session in session_hashes],
-            )
+        """Notes that these sessions are in use, so that others of their links end before them.
+
+        That is kept in memory alone: pages come back within seconds of a restart.
+        """
+        self._used |= dict.fromkeys(session_hashes, now())
 
     def link_of_session(self, session_hash: str) -> int | None:
         """The number of the link by which a session that holds came, if that is known."""
