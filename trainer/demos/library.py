@@ -25,7 +25,7 @@ import numpy as np
 from onedemo import static
 from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import write_atomic
-from onedemo.core.names import check_name
+from onedemo.core.names import check_name, check_new_name
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.import_checks import check_options
 from onedemo.demos.sandboxed_decoder import Limits, Options, decode
@@ -76,7 +76,7 @@ def import_video(
         UserError: If the video or an option is unusable; nothing is then stored.
     """
     path, demos_dir = Path(path), Path(demos_dir)
-    check_name(name)
+    check_new_name(check_name(name))
     check_options(start=start, end=end, crop=crop, fps=fps)
     if not path.is_file():
         raise UserError(f"there is no video file at {path}")
