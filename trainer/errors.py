@@ -31,6 +31,7 @@ _NO_MEMORY = ("can't allocate memory", "Insufficient memory")
 """As torch and OpenCV say it."""
 _LOCKED = "Another program holds the database: end it or wait for it."
 _SAID = {
+    "SQLITE_CANTOPEN": _CAUSES[errno.EACCES],
     "SQLITE_FULL": _CAUSES[errno.ENOSPC],
     "SQLITE_READONLY": _CAUSES[errno.EROFS],
     "SQLITE_BUSY": _LOCKED,

@@ -29,7 +29,7 @@ import numpy as np
 from onedemo import static
 from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import hold, write_atomic
-from onedemo.core.names import check_name
+from onedemo.core.names import check_name, check_new_name
 from onedemo.demos.containers import check_file
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.import_checks import StoredCheck, check_options
@@ -82,7 +82,7 @@ def import_video(
         UserError: If the video or an option is unusable; nothing is then stored.
     """
     path, demos_dir = Path(path), Path(demos_dir)
-    check_name(name)
+    check_new_name(check_name(name))
     check_options(start=start, end=end, crop=crop, fps=fps)
     check_file(path)
     options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)

@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from onedemo.storage.schema import check_version, migrate
 log = logging.getLogger("onedemo")
 
 FILE_NAME = "onedemo.sqlite3"
+_MAKING = threading.Lock()
 _WAIT_S = 10.0
 """How long a write waits for another one to end."""
 _LOOK_S = 0.5
@@ -55,9 +56,7 @@ class Database:
             if is_shared(self.path.parent):
                 for lock in self.path.parent.glob("runs/*/lock"):
                     refuse_if_elsewhere(lock)
-            if not self.path.exists():
-                self._check_new()
-                open(self.path, "ab", opener=private_opener).close()  # SQLite would let others read it
+            self._make()
             self._db = self._connect()
         except (OSError, sqlite3.Error) as error:
             raise UserError(
@@ -81,7 +80,7 @@ class Database:
                 f"{self.path} cannot be opened for writing ({error}); "
                 "check its permissions or choose another --data-dir"
             ) from None
-        self._files = self._there()
+        self._files = self._there() or (None, None, None)
 
     def close(self) -> None:
         """Closes the connections; the store cannot be used afterwards."""
@@ -145,6 +144,16 @@ class Database:
     def _connect(self) -> sqlite3.Connection:
         return sqlite3.connect(self.path, isolation_level=None, check_same_thread=False, timeout=_WAIT_S)
 
+    def _make(self) -> None:
+        """An empty file for its owner alone, which SQLite would let others read, if there is none."""
+        # To close a file of a database lets go of all locks that this process has on it (POSIX): not while
+        # another thread opens it.
+        with _MAKING:
+            if not self.path.exists():
+                self._check_new()
+                with suppress(FileExistsError):
+                    open(self.path, "xb", opener=private_opener).close()
+
     def _check_new(self) -> None:
         lost = [path.parent for path in self.path.parent.glob("runs/*/config.toml")]
         if lost:
@@ -153,13 +162,19 @@ class Database:
                 "another directory, or move the directory runs away to begin anew"
             )
 
-    def _there(self) -> tuple[tuple[int, int] | None, ...]:
-        """Which files lie where the database, its log and the index of that should be."""
-        return tuple(_identity(f"{self.path}{suffix}") for suffix in ("", "-wal", "-shm"))
+    def _there(self) -> tuple[tuple[int, int] | None, ...] | None:
+        """Which files lie where the database, its log and the index of that should be.
+
+        None if that cannot be told, since the right to look is gone, say.
+        """
+        try:
+            return tuple(_identity(f"{self.path}{suffix}") for suffix in ("", "-wal", "-shm"))
+        except OSError:
+            return None
 
     def _check(self) -> None:
         """Raises DatabaseLost from the moment on when one of the files is another, or none."""
-        if not self.fault and (there := self._there()) != self._files:
+        if not self.fault and (there := self._there()) != self._files and there is not None:
             names = [
                 f"{FILE_NAME}{suffix}"
                 for suffix, was, now_ in zip(("", "-wal", "-shm"), self._files, there, strict=True)
@@ -197,7 +212,7 @@ class Database:
 
     def _look(self) -> None:
         while not self.fault and not self._closed.wait(_LOOK_S):
-            if self._there() != self._files:
+            if self._there() not in (self._files, None):
                 with self._lock:
                     try:
                         if not self._closed.is_set():
@@ -220,9 +235,10 @@ def _patiently(db: sqlite3.Connection, sql: str) -> None:
 
 
 def _identity(path: str) -> tuple[int, int] | None:
+    """Device and number of a file; None if it is not there."""
     try:
         found = os.stat(path)
-    except OSError:
+    except FileNotFoundError:
         return None
     return found.st_dev, found.st_ino
 

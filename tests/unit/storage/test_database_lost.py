@@ -108,6 +108,20 @@ def test_a_press_after_the_files_are_gone_is_not_acknowledged(tmp_path):
             say(store, 1)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody without the right")
+def test_files_that_one_may_not_look_at_are_not_lost(tmp_path):
+    with closing(Store(tmp_path / "data")) as store:
+        say(store, 1)
+        os.seteuid(65534)
+        try:
+            assert store.database._there() is None
+            time.sleep(1.2)  # the watch has looked twice
+        finally:
+            os.seteuid(0)
+        assert not store.database.fault
+        say(store, 1)
+
+
 def test_a_database_that_is_lost_while_there_are_runs_is_not_made_anew(tmp_path):
     config = tmp_path / "runs" / "jump-1" / "config.toml"
     config.parent.mkdir(parents=True)
