@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import BinaryIO
 
-import av
+import av.logging
 import cv2
 import numpy as np
 

@@ -18,10 +18,11 @@ from itertools import chain
 from typing import BinaryIO
 
 import av
+import av.error
 import av.filter
+import av.logging
 import cv2
 import numpy as np
-from av.sidedata.sidedata import Type
 from av.video.reformatter import Interpolation
 
 from onedemo.demos.containers import CONVERT, missing_bytes
@@ -98,9 +99,9 @@ class Source:
                 options={"max_pixels": str(_MOST_PIXELS), "threads": "1"},
                 container_options={"format_whitelist": FORMATS, "protocol_whitelist": "pipe"},
             )  # fmt: skip
-        except av.MemoryError:
+        except av.error.MemoryError:
             raise MemoryError from None
-        except (av.FFmpegError, ValueError, OSError) as error:
+        except (av.error.FFmpegError, ValueError, OSError) as error:
             raise self._no_video() from error
         self._stream = self._choose()
         context = self._stream.codec_context
@@ -216,7 +217,7 @@ class Source:
         stream = self._stream
         if _stamp(self._first) is None or not stream.time_base:
             return self._all
-        with suppress(av.FFmpegError):
+        with suppress(av.error.FFmpegError):
             for before in (0.0, 10.0):
                 wanted = self._origin + max(0.0, start - before)
                 self._container.seek(int(wanted / stream.time_base), stream=stream, backward=True)
@@ -246,16 +247,16 @@ class Source:
                     continue
                 try:
                     yield from self._stream.decode(packet)  # type: ignore[misc]
-                except av.EOFError:
+                except av.error.EOFError:
                     return
-                except av.MemoryError:
+                except av.error.MemoryError:
                     raise MemoryError from None
-                except av.FFmpegError:
+                except av.error.FFmpegError:
                     self.broken += 1
-        except (av.FFmpegError, OSError):  # the container breaks off
+        except (av.error.FFmpegError, OSError):  # the container breaks off
             try:
                 yield from self._stream.decode(None)  # type: ignore[misc]
-            except av.FFmpegError:
+            except av.error.FFmpegError:
                 pass
 
     def _deinterlaced(self, frames: Iterator[av.VideoFrame]) -> Iterator[av.VideoFrame]:
@@ -370,7 +371,7 @@ def _ready(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
     while True:
         try:
             yield graph.vpull()
-        except (av.BlockingIOError, av.EOFError):
+        except (av.error.BlockingIOError, av.error.EOFError):
             return
 
 
@@ -391,7 +392,7 @@ def _square(width: int, height: int, aspect: float) -> tuple[int, int]:
 
 def _orientation(frame: av.VideoFrame) -> tuple[int, int, int, int]:
     """The display matrix as (a, b, c, d): x' = a x + c y, y' = b x + d y, each -1, 0 or 1."""
-    matrix = frame.side_data.get(Type.DISPLAYMATRIX)
+    matrix = frame.side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return 1, 0, 0, 1
     a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].astype(float)

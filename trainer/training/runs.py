@@ -57,8 +57,8 @@ def find_run(
     run = found[-1]
     if run["demo_sha256"] != demo.sha256:
         raise UserError(
-            f"run {run['id']!r} was made with another video than demo {demo.name!r} is now; "
-            "start a new run with --new-run"
+            f"run {run['id']!r} was made with another video than demo {demo.name!r} is now; put "
+            f"demos/{run['demo_sha256']} back from a backup, or start a new run with --new-run"
         )
     file = RunDirectory(data_dir, run["id"]).config
     if not file.exists():  # lost with the directory; the database has it too

@@ -39,8 +39,8 @@ def frames():
 
 @pytest.fixture
 def demo(frames, tmp_path):
-    write_webm(tmp_path / "move.webm", frames, fps=30)
-    return import_video(tmp_path / "move.webm", name="move", demos_dir=tmp_path / "demos")
+    write_webm(tmp_path / "move.webm", frames, fps=20)
+    return import_video(tmp_path / "move.webm", name="move", demos_dir=tmp_path / "demos", fps=20)
 
 
 # --- EfficientNet-Lite0 ---------------------------------------------------------------------------
