@@ -26,8 +26,8 @@ from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 
 _PATIENCE_S = 900.0
-_AHEAD = 4
-"""Clips that wait for each person: as many as one rates while the robot practises once."""
+_AHEAD = 6
+"""Clips that wait for each person: two are at the page, two may be rated while the robot practises once."""
 _SPARE = 12
 
 
