@@ -20,6 +20,7 @@ from onedemo.storage.store import Store
 from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles, awaited, pictures_of, spare, tidy
+from onedemo.training.rating_queue import RatingQueue
 from onedemo.types import Demo, Segment
 
 MB = 1_000_000
@@ -196,3 +197,12 @@ def test_the_built_in_demo_is_read_once_for_all_clips(tmp_path):
     pictures._fitted.cache_clear()
     assert pictures._fitted(demo) is pictures._fitted(find_demo("hopper-backflip", tmp_path))
     pictures._fitted.cache_clear()
+
+
+def test_as_many_clips_wait_as_people_rate_while_the_robot_practises_once():
+    queue = RatingQueue(None, "r", small_config(), None)  # type: ignore[arg-type]
+    paces = [
+        queue._ratings_an_iteration(*seen) for seen in ((0, 0), (0, 30), (1, 40), (1, 90), (2, 100), (3, 100))
+    ]
+    assert paces == [0, 0, 40, 40, 60, 0]
+    assert queue._ratings_an_iteration(9, 500) == 0  # a run that was resumed
