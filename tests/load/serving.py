@@ -28,8 +28,8 @@ from onedemo.storage.store import Store
 FEW_STATES = ("practice.random_lanes=8", "practice.bank_tries=500", "ratings.queue=4")
 """Settings of a run that is not to learn anything: it begins 5 s sooner, and draws fewer clips."""
 _PATIENCE_S = 900.0
-_AHEAD = 4
-"""Clips that wait for each person: as many as one rates while the robot practises once."""
+_AHEAD = 6
+"""Clips that wait for each person: two are at the page, two may be rated while the robot practises once."""
 _SPARE = 12
 
 

@@ -36,8 +36,8 @@ _WIDTH, _HEIGHT = 160, 120
 _QUALITY = 82
 _AT_ONCE = 6
 """Pictures of a film between two looks at what is more urgent."""
-_YOUNG_S = 60.0
-"""Pictures are not deleted sooner: somebody may just have asked for them."""
+_RECENT_S = 60.0
+"""A picture that somebody asked for stays so long, whatever room it takes."""
 
 Job = Callable[[Renderer], Any]
 
@@ -58,6 +58,7 @@ class PictureFiles:
         self._frame = frame_of_step(np.arange(steps), dt, demo.fps, demo.frames)
         self._lock = threading.Lock()
         self._coming: dict[Path, Future[Path]] = {}
+        self._asked: dict[Path, float] = {}
 
     def draw(self, file: Path, job: Callable[[], Job], order: Order = Order.AWAITED) -> Future[Path]:
         """The future of a file that is there, with what its job left in it.
@@ -71,6 +72,8 @@ class PictureFiles:
             Exception: Whatever ``job`` raises; what the drawing raises is in the future.
         """
         with self._lock:
+            if order is not Order.AHEAD:
+                self._asked[file] = time.monotonic()
             if (coming := self._coming.get(file)) is not None:
                 return coming
             future: Future[Path] = Future()
@@ -93,6 +96,13 @@ class PictureFiles:
 
         drawn.add_done_callback(tell)
         return future
+
+    def recent(self) -> set[Path]:
+        """What somebody has asked for in the last minute."""
+        since = time.monotonic() - _RECENT_S
+        with self._lock:
+            self._asked = {file: at for file, at in self._asked.items() if at > since}
+            return set(self._asked)
 
     def clip(
         self, file: Path, demo_step: int, read: Callable[[], Sequence[Segment]],
@@ -183,20 +193,17 @@ def _fitted(demo: Demo) -> np.ndarray:
 # What is deleted
 
 
-def spare(
-    files: Collection[tuple[Path, int, float]], keep: Collection[Path], most: float, now: float
-) -> list[Path]:
+def spare(files: Collection[tuple[Path, int, float]], keep: Collection[Path], most: float) -> list[Path]:
     """Which pictures to delete, so that the rest takes no more than ``most``: the oldest.
 
     Args:
         files: Path, bytes and time of the last change of each.
         keep: Those that somebody will look at.
         most: Bytes.
-        now: The time, in the same seconds.
     """
     total, gone = sum(size for _, size, _ in files), []
-    for path, size, changed in sorted(files, key=lambda entry: entry[2]):
-        if total <= most or changed > now - _YOUNG_S:
+    for path, size, _ in sorted(files, key=lambda entry: entry[2]):
+        if total <= most:
             break
         if path not in keep:
             gone.append(path)
@@ -225,17 +232,23 @@ def awaited(store: Store, files: RunDirectory) -> set[Path]:
     return clips | pairs
 
 
-def tidy(store: Store, files: RunDirectory, most: float, now: float | None = None) -> int:
+def tidy(store: Store, files: RunDirectory, most: float, keep: Collection[Path] = ()) -> int:
     """Deletes the pictures of a run that nobody waits for, oldest first, down to ``most`` bytes in all.
 
     A server may be running on it: what somebody looks at again is drawn again.
+
+    Args:
+        store: Knows what waits.
+        files: Of the run.
+        most: Bytes.
+        keep: What stays as well.
 
     Returns:
         Bytes freed.
     """
     found = pictures_of(files)
     size = {path: bytes_ for path, bytes_, _ in found}
-    gone = spare(found, awaited(store, files), most, time.time() if now is None else now)
+    gone = spare(found, awaited(store, files) | set(keep), most)
     for path in gone:
         path.unlink(missing_ok=True)
     return sum(size[path] for path in gone)

@@ -51,6 +51,7 @@ _TIDY_S = 10.0
 class _Drawn(NamedTuple):
     """What is drawn of a run that somebody looks at."""
 
+    pictures: PictureFiles
     clips: ClipMaker
     pairs: ComparisonQueue
     rollouts: Gallery
@@ -117,6 +118,7 @@ class TrainingRun:
             pictures = PictureFiles(renderer, demo, self.dt)
             self.queue.clips = ClipMaker(store, file=self.files.clip, pictures=pictures)
             self._drawn = _Drawn(
+                pictures,
                 self.queue.clips,
                 ComparisonQueue(store, run, self.files.pair, pictures, config.seed),
                 Gallery(self.files.rollouts, pictures),
@@ -209,7 +211,8 @@ class TrainingRun:
             self._drawn.pairs.fill(self._opened, self._pool)
             if time.monotonic() > self._tidy_at:
                 self._tidy_at = time.monotonic() + _TIDY_S
-                tidy(self.store, self.files, self.config.storage.pictures_gb * 1e9)
+                most = self.config.storage.pictures_gb * 1e9
+                tidy(self.store, self.files, most, self._drawn.pictures.recent())
 
     def refit(self, at_least: int = 1) -> bool:
         """Publishes a new snapshot if there are ``at_least`` so many new events; whether it did."""

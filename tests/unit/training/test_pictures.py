@@ -3,7 +3,6 @@
 import os
 import re
 import threading
-import time
 from concurrent.futures import Future
 from contextlib import closing
 
@@ -21,6 +20,7 @@ from onedemo.storage.store import Store
 from onedemo.training.clip_worker import ClipMaker
 from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles, awaited, pictures_of, spare, tidy
+from onedemo.training.rating_queue import RatingQueue
 from onedemo.types import Demo, Segment
 
 MB = 1_000_000
@@ -80,11 +80,10 @@ def test_what_is_asked_twice_is_drawn_once_and_what_failed_is_drawn_again(tmp_pa
 def test_the_oldest_that_nobody_waits_for_go_first(tmp_path):
     files = [(tmp_path / str(k), 10, 100.0 * k) for k in range(10)]
     keep = {tmp_path / "0", tmp_path / "2"}
-    named = [int(path.name) for path in spare(files, keep, 70, 5000.0)]
+    named = [int(path.name) for path in spare(files, keep, 70)]
     assert named == [1, 3, 4]
-    assert [int(path.name) for path in spare(files, keep, 0, 5000.0)] == [1, 3, 4, 5, 6, 7, 8, 9]
-    assert spare(files, keep, 100, 5000.0) == []
-    assert [int(path.name) for path in spare(files, keep, 0, 430.0)] == [1, 3]  # the others are young
+    assert [int(path.name) for path in spare(files, keep, 0)] == [1, 3, 4, 5, 6, 7, 8, 9]
+    assert spare(files, keep, 100) == []
 
 
 def thousand(store):
@@ -106,7 +105,8 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
     with closing(Store(tmp_path)) as store, RenderThread(exact=False) as drawing:
         files = RunDirectory(tmp_path, "r")
         clips = thousand(store)
-        maker = ClipMaker(store, file=files.clip, pictures=PictureFiles(drawing, demo, 0.008))
+        pictures = PictureFiles(drawing, demo, 0.008)
+        maker = ClipMaker(store, file=files.clip, pictures=pictures)
         maker.submit(clips[::100])
         drawing.submit(lambda renderer: None).result(120)
         drawn = [files.clip(clip.id).read_bytes() for clip in clips[::100]]
@@ -140,9 +140,9 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         again = maker.picture(looked).result(60)
         assert again == files.clip(looked.id) and again.read_bytes() == drawn[1]
         assert jpeg_fault(drawn[1]) == ""
-        tidy(store, files, 0)
+        tidy(store, files, 0, pictures.recent())
         assert again.exists()  # it was asked for just now
-        tidy(store, files, 0, now=time.time() + 100)
+        tidy(store, files, 0)
         assert {path for path, _, _ in pictures_of(files)} == awaited(store, files)
         assert main(["tidy", "--data-dir", str(tmp_path)]) == 0
         assert "0.0 MB freed" in capsys.readouterr().out
@@ -197,3 +197,12 @@ def test_the_built_in_demo_is_read_once_for_all_clips(tmp_path):
     pictures._fitted.cache_clear()
     assert pictures._fitted(demo) is pictures._fitted(find_demo("hopper-backflip", tmp_path))
     pictures._fitted.cache_clear()
+
+
+def test_as_many_clips_wait_as_people_rate_while_the_robot_practises_once():
+    queue = RatingQueue(None, "r", small_config(), None)  # type: ignore[arg-type]
+    paces = [
+        queue._ratings_an_iteration(*seen) for seen in ((0, 0), (0, 30), (1, 40), (1, 90), (2, 100), (3, 100))
+    ]
+    assert paces == [0, 0, 40, 40, 60, 0]
+    assert queue._ratings_an_iteration(9, 500) == 0  # a run that was resumed
