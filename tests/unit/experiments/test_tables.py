@@ -28,7 +28,7 @@ def test_a_plan_has_different_jobs_of_settings_that_exist(table_module, quick):
 
 
 def test_settings_that_were_constants_change_no_reported_job():
-    """A finished run from before there were such settings is still found; one with other values is another."""
+    """A finished run of before there were such settings is found; one with other values is another."""
 
     def digest(**changes):
         return whole_config({"demo": "hopper-backflip", "method": "onedemo", "steps": 1000, "set": changes})
