@@ -3,7 +3,7 @@
 import pytest
 
 from onedemo.config import METHODS, load_config
-from onedemo.experiments.jobs.method import run_config
+from onedemo.experiments.jobs.method import run_config, whole_config
 from onedemo.experiments.registry import TABLES, find_table
 from onedemo.experiments.report import document
 from onedemo.experiments.report.account import complete
@@ -25,6 +25,17 @@ def test_a_plan_has_different_jobs_of_settings_that_exist(table_module, quick):
             config = run_config(job.settings, job.seed)
             assert config.rollouts.threads == 1 and config.seed == job.seed
             assert config.ratings.pretrain + config.ratings.online == job.settings["ratings"]
+
+
+def test_settings_that_were_constants_change_no_reported_job():
+    """A finished run of before there were such settings is found; one with other values is another."""
+
+    def digest(**changes):
+        return whole_config({"demo": "hopper-backflip", "method": "onedemo", "steps": 1000, "set": changes})
+
+    as_ever = {"practice.random_lanes": 64, "practice.bank_tries": 8000}
+    assert digest() == digest(**as_ever)
+    assert len({str(digest(**as_ever | {key: 7})) for key in as_ever} | {str(digest())}) == 3
 
 
 def test_nothing_gets_fewer_steps_than_onedemo():
