@@ -181,12 +181,12 @@ class AccessControl:
         return await self._open(request, token, link)
 
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
-        opened = None
-        if link is not None:
-            session = await self._session_of(request, link) or new_session_token()
-            opened = await asyncio.to_thread(
-                self._store.accounts.open_link, hash_token(token), hash_token(session)
-            )
+        if link is None:
+            return await self._refuse(request, token, link)
+        session = await self._session_of(request, link) or new_session_token()
+        opened = await asyncio.to_thread(
+            self._store.accounts.open_link, hash_token(token), hash_token(session)
+        )
         if opened is None:
             return await self._refuse(request, token, link)
         await asyncio.to_thread(self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}")

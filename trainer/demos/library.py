@@ -151,7 +151,7 @@ def rename_demo(demo: Demo, name: str, demos_dir: Path) -> Demo:
     Raises:
         UserError: If it came with the program, or the name is not allowed or taken.
     """
-    check_name(name)
+    check_new_name(check_name(name))
     path = _own_directory(demo, demos_dir) / "demo.json"
     with _names(demos_dir):
         _check_free(name, list_demos(demos_dir))
