@@ -175,9 +175,9 @@ class AccessControl:
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
         if self._wrong[self._listening.client(request)].empty:
             return self._login_page(429, _REFUSED["too many"])
-        opened = None
+        session, opened = new_session_token(), None
         if link is not None:
-            session = await self._session_of(request, link) or new_session_token()
+            session = await self._session_of(request, link) or session
             opened = await asyncio.to_thread(
                 self._store.accounts.open_link, hash_token(token), hash_token(session)
             )
