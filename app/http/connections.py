@@ -23,7 +23,7 @@ from typing import Generic, TypeVar
 from aiohttp import web
 
 from onedemo.app.http.bind import network
-from onedemo.app.http.rate_limit import Bucket
+from onedemo.app.http.rate_limit import MOST_PAGES, Bucket
 
 log = logging.getLogger("onedemo.page")
 
@@ -79,7 +79,7 @@ class Limits:
             strangers_each=min(64, strangers // 2) if addresses_known else strangers,
             members=min(2048, descriptors // 4),
             members_each=64,
-            pages=min(300, descriptors // 8),
+            pages=min(MOST_PAGES, descriptors // 8),
         )
 
 
