@@ -86,6 +86,8 @@ class PictureFiles:
         def tell(drawn: Future[None]) -> None:
             with self._lock:
                 del self._coming[file]
+                if file in self._asked:  # a film may have taken minutes
+                    self._asked[file] = time.monotonic()
             if drawn.cancelled():
                 future.cancel()
                 future.set_running_or_notify_cancel()
@@ -98,10 +100,10 @@ class PictureFiles:
         return future
 
     def recent(self) -> set[Path]:
-        """What somebody has asked for in the last minute."""
+        """What somebody has asked for and had in the last minute, or has yet to have."""
         since = time.monotonic() - _RECENT_S
         with self._lock:
-            self._asked = {file: at for file, at in self._asked.items() if at > since}
+            self._asked = {f: at for f, at in self._asked.items() if at > since or f in self._coming}
             return set(self._asked)
 
     def clip(

@@ -77,6 +77,23 @@ def test_what_is_asked_twice_is_drawn_once_and_what_failed_is_drawn_again(tmp_pa
     assert pictures.draw(file, lambda: lambda renderer: None) is not again and len(drawing.jobs) == 4
 
 
+def test_a_film_that_took_long_is_there_for_whoever_waited(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("onedemo.training.pictures.time.monotonic", lambda: now[0])
+    drawing = Asked()
+    pictures = PictureFiles(drawing, demo_of(30, 30.0), 0.008)
+    film, ahead = tmp_path / "film.webm", tmp_path / "ahead.jpg"
+    pictures.draw(film, lambda: lambda renderer: None, Order.FILM)
+    pictures.draw(ahead, lambda: lambda renderer: None, Order.AHEAD)
+    for now[0] in (1.0, 300.0):
+        assert pictures.recent() == {film}
+    drawing.jobs[0][2].set_result(None)
+    now[0] = 350.0
+    assert pictures.recent() == {film}
+    now[0] = 361.0
+    assert pictures.recent() == set()
+
+
 def test_the_oldest_that_nobody_waits_for_go_first(tmp_path):
     files = [(tmp_path / str(k), 10, 100.0 * k) for k in range(10)]
     keep = {tmp_path / "0", tmp_path / "2"}
