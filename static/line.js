@@ -60,7 +60,7 @@ const line = (() => {
     try {
       const answer = await request(here("session"), { cache: "no-store" });
       down = false;
-      if (answer.status === 401) end(await reason(answer));
+      if (answer.status === 401) end((await reason(answer)) || ENDED);
     } catch (error) {
       if (!unanswered(error)) throw error;
       down = true;
@@ -71,7 +71,13 @@ const line = (() => {
 
   async function reason(answer) {
     const text = answer.headers.get("Content-Type")?.startsWith("text/plain") ? await answer.text() : "";
-    return text.trim() || ENDED;
+    return text.trim();
+  }
+
+  // Something was refused because there is no session: the server is asked why.
+  async function ended() {
+    await ask();
+    if (!over) end(ENDED);
   }
 
   // Resolves when the server answers again; rejected with the reason if the session has ended.
@@ -197,5 +203,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, end, here, reason, request, settings, takeTab, unanswered };
+  return { Closed, answers, during, ended, here, request, settings, takeTab, unanswered };
 })();

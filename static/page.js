@@ -49,21 +49,21 @@ const page = (() => {
     Promise.all([sent, new Promise((go) => setTimeout(go, 180))]).then(() => button.classList.remove("od-pressed"));
   }
 
-  // The address of something that belongs to this person's page.
-  const here = line.here;
-
   class Refused extends Error {}
   class PageGone extends Refused {}
 
+  // What the server asks of whatever changes something: no other site can read it.
+  const named = () => ({ "X-Onedemo-Page": shown(".od-header")?.dataset.page ?? "" });
+
   async function post(where, what, options = {}) {
-    const answer = await line.request(here(where), {
+    const answer = await line.request(line.here(where), {
       method: "POST",
-      headers: { "Content-Type": "application/json" },
+      headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(what),
       ...options,
     });
     if (answer.status === 401) {
-      line.end(await line.reason(answer));
+      await line.ended();
       throw new line.Closed("This was not saved: this page is closed.");
     }
     if (answer.status === 410) throw new PageGone(await answer.text());
@@ -98,7 +98,7 @@ const page = (() => {
   function send(press) {
     const id = [...crypto.getRandomValues(new Uint32Array(4))].join("-");
     const body = { page: pageName(), id, ...press };
-    kept.add(body);
+    if (press.press !== "practise") kept.add(body);
     return enqueue(body);
   }
 
@@ -404,10 +404,11 @@ const page = (() => {
     };
     request.onerror = () => done("The connection was lost during the upload. Please try again.");
     request.open("POST", form.dataset.upload);
-    line.during(new Promise((over) => (request.onloadend = over)));
+    for (const [name, value] of Object.entries(named())) request.setRequestHeader(name, value);
     button.disabled = true;
     place.textContent = "Uploading";
     request.send(new FormData(form));
+    line.during(new Promise((over) => (request.onloadend = over)));
   });
   document.addEventListener("input", (event) => {
     const form = event.target.closest?.("[data-filter]");
@@ -454,5 +455,5 @@ const page = (() => {
     document.body.append(note);
   });
 
-  return { here, post };
+  return { post };
 })();

@@ -34,7 +34,7 @@
     const last = body.lastElementChild?.querySelector("th").textContent;
     if (older && last) query.set("before", last);
     try {
-      const answer = await line.request(page.here(`ratings?${query}`), { cache: "no-store" });
+      const answer = await line.request(line.here(`ratings?${query}`), { cache: "no-store" });
       if (!answer.ok) throw new Error(await answer.text());
       const { ratings, more: left, raters } = await answer.json();
       const rows = ratings.map(row);
