@@ -113,8 +113,9 @@ const line = (() => {
     const back = backAt !== null && performance.now() - backAt;
     if (!opened) {
       if (down) pill("There is no answer from the server. Trying again.");
-      else if (back !== false) reload();
-      else if (asked) unconnected();
+      else if (back === false) asked && unconnected();
+      else if (back < settings.openMs) pill("The server is back. Loading the page.");
+      else reload();
     } else if (dimmed) {
       pill(down || back === false ? "Connection lost. Trying again; nothing is lost." : "The server is back. Reconnecting.");
       if (!down && back !== false && back >= grace) reload();
