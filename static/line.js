@@ -55,7 +55,7 @@ const line = (() => {
     try {
       const answer = await request("session", { cache: "no-store" });
       down = false;
-      if (answer.status === 401) end(await reason(answer));
+      if (answer.status === 401) end((await reason(answer)) || ENDED);
     } catch (error) {
       if (!unanswered(error)) throw error;
       down = true;
@@ -66,7 +66,13 @@ const line = (() => {
 
   async function reason(answer) {
     const text = answer.headers.get("Content-Type")?.startsWith("text/plain") ? await answer.text() : "";
-    return text.trim() || ENDED;
+    return text.trim();
+  }
+
+  // Something was refused because there is no session: the server is asked why.
+  async function ended() {
+    await ask();
+    if (!over) end(ENDED);
   }
 
   // Resolves when the server answers again; rejected with the reason if the session has ended.
@@ -102,8 +108,9 @@ const line = (() => {
     const back = backAt !== null && performance.now() - backAt;
     if (!opened) {
       if (down) pill("There is no answer from the server. Trying again.");
-      else if (back !== false) reload();
-      else if (asked) unconnected();
+      else if (back === false) asked && unconnected();
+      else if (back < settings.openMs) pill("The server is back. Loading the page.");
+      else reload();
     } else if (dimmed) {
       pill(down || back === false ? "Connection lost. Trying again; nothing is lost." : "The server is back. Reconnecting.");
       if (!down && back !== false && back >= grace) reload();
@@ -192,5 +199,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, end, reason, request, settings, takeTab, unanswered };
+  return { Closed, answers, during, ended, request, settings, takeTab, unanswered };
 })();

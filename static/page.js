@@ -49,11 +49,11 @@ const page = (() => {
     Promise.all([sent, new Promise((go) => setTimeout(go, 180))]).then(() => button.classList.remove("od-pressed"));
   }
 
-  // What the server asks of whatever changes something: no other site can read it.
-  const named = () => ({ "X-Onedemo-Page": shown(".od-header")?.dataset.page ?? "" });
-
   class Refused extends Error {}
   class PageGone extends Refused {}
+
+  // What the server asks of whatever changes something: no other site can read it.
+  const named = () => ({ "X-Onedemo-Page": shown(".od-header")?.dataset.page ?? "" });
 
   async function post(where, what, options = {}) {
     const answer = await line.request(where, {
@@ -63,7 +63,7 @@ const page = (() => {
       ...options,
     });
     if (answer.status === 401) {
-      line.end(await line.reason(answer));
+      await line.ended();
       throw new line.Closed("This was not saved: this page is closed.");
     }
     if (answer.status === 410) throw new PageGone(await answer.text());
@@ -98,7 +98,7 @@ const page = (() => {
   function send(press) {
     const id = [...crypto.getRandomValues(new Uint32Array(4))].join("-");
     const body = { page: pageName(), id, ...press };
-    kept.add(body);
+    if (press.press !== "practise") kept.add(body);
     return enqueue(body);
   }
 
@@ -414,10 +414,10 @@ const page = (() => {
     request.onerror = () => done("The connection was lost during the upload. Please try again.");
     request.open("POST", form.dataset.upload);
     for (const [name, value] of Object.entries(named())) request.setRequestHeader(name, value);
-    line.during(new Promise((over) => (request.onloadend = over)));
     button.disabled = true;
     place.textContent = "Uploading";
     request.send(new FormData(form));
+    line.during(new Promise((over) => (request.onloadend = over)));
   });
   document.addEventListener("input", (event) => {
     const form = event.target.closest?.("[data-filter]");

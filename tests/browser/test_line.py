@@ -16,10 +16,7 @@ from browser.test_page import DESKTOP, opened, press_and_wait, shown_clip, until
 pytestmark = pytest.mark.seam
 
 LONG = bool(os.environ.get("ONEDEMO_LONG"))
-QUICK = (
-    "window.lineSettings ="
-    " { lookMs: 50, askMs: 150, graceMs: 100, openMs: 1000, lateMs: 400, answerMs: 1000 };"
-)
+QUICK = "window.lineSettings = { lookMs: 50, askMs: 150, graceMs: 100, lateMs: 400, answerMs: 1500 };"
 NO_FOCUS = "document.hasFocus = () => false;"  # a window on the second screen: Viser does not even try
 PILL, CARD = ".od-line.od-pill", ".od-line .od-card"
 

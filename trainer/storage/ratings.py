@@ -214,7 +214,7 @@ class Ratings:
             " AND (w.withdrawn IS NOT NULL OR (w.id IS NULL AND NOT ?4)) ORDER BY e.id DESC LIMIT ?5",
             (run, rater, before if before is not None else 2**62, withdrawn, most),
         )
-        return [Given(*row)._replace(repeat=bool(row[4])) for row in rows]
+        return [Given._make((*row[:4], bool(row[4]), *row[5:])) for row in rows]
 
     def _event(
         self, clip_id: int, rater_id: int, kind: str, value: int | None, latency_ms: int, *,
