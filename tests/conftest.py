@@ -98,9 +98,9 @@ def site(tmp_path: Path) -> Iterator[Site]:
     """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
-    from onedemo.app.http.bind import Listening
     from onedemo.app.http.server import Front
     from onedemo.app.http.tokens import issue_link, read_secret
+    from onedemo.app.network.bind import Listening
     from onedemo.app.services.demo_images import Pictures
     from onedemo.app.ui.app import Page
 

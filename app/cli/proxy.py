@@ -50,7 +50,7 @@ def proxy(
         base_path: The path that the study has there, such as /study1.
         port: Of the server on this machine.
     """
-    from onedemo.app.http.bind import Listening
+    from onedemo.app.network.bind import Listening
 
     base_path = base_path.rstrip("/")
     Listening(names=(host_name,), base_path=base_path)  # says what is wrong with them

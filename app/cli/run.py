@@ -85,7 +85,7 @@ def serve(
         raise UserError(f"argument --port: must be a whole number from 0 to 65535, got '{port}'")
     from onedemo.app.annotation.assignment import Again
     from onedemo.app.cli.serve import serve as serve_page
-    from onedemo.app.http.bind import Listening
+    from onedemo.app.network.bind import Listening
     from onedemo.demos.library import find_demo
 
     listening = Listening(

@@ -8,9 +8,9 @@ import threading
 from pathlib import Path
 
 from onedemo.app.annotation.assignment import Again
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front, check_port
 from onedemo.app.http.tokens import issue_link, read_secret, write_address
+from onedemo.app.network.bind import Listening
 from onedemo.app.services.run_manager import Study
 from onedemo.app.ui.app import Page
 from onedemo.config import RunConfig

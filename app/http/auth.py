@@ -14,11 +14,11 @@ from urllib.parse import parse_qs
 from aiohttp import web
 
 from onedemo.app.http import assets
-from onedemo.app.http.bind import Listening
-from onedemo.app.http.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
-from onedemo.app.http.refusals import read_body
 from onedemo.app.http.sessions import RATER, Sessions
 from onedemo.app.http.tokens import hash_token, new_session_token
+from onedemo.app.network.bind import Listening
+from onedemo.app.network.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
+from onedemo.app.network.refusals import read_body
 from onedemo.app.templates import render
 from onedemo.storage.accounts import SESSION_DAYS, Link
 from onedemo.storage.store import Store

@@ -24,12 +24,15 @@ from onedemo.app.annotation.presses import PageGone, Press, read_press
 from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.http import assets
 from onedemo.app.http.auth import SECURITY_HEADERS, AccessControl, Route
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.commands import Actions
-from onedemo.app.http.connections import Connections, Limits, raise_descriptors
 from onedemo.app.http.exports import Downloads
 from onedemo.app.http.media import Files, Filmed
-from onedemo.app.http.rate_limit import (
+from onedemo.app.http.sessions import PERSON, RATER
+from onedemo.app.http.uploads import Uploads
+from onedemo.app.http.viser_proxy import Proxy
+from onedemo.app.network.bind import Listening
+from onedemo.app.network.connections import Connections, Limits, raise_descriptors
+from onedemo.app.network.rate_limit import (
     ACTIONS_WAITING,
     PRESSES_AT_ONCE,
     PRESSES_PER_S,
@@ -38,10 +41,7 @@ from onedemo.app.http.rate_limit import (
     Buckets,
     Places,
 )
-from onedemo.app.http.refusals import Refusals, read_body, read_json
-from onedemo.app.http.sessions import PERSON, RATER
-from onedemo.app.http.uploads import Uploads
-from onedemo.app.http.viser_proxy import Proxy
+from onedemo.app.network.refusals import Refusals, read_body, read_json
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
 from onedemo.types import Status

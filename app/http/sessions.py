@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 from aiohttp import web
 
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.tokens import hash_token
+from onedemo.app.network.bind import Listening
 from onedemo.storage.accounts import SESSION_DAYS
 from onedemo.storage.store import Store
 from onedemo.types import Rater

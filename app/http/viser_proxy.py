@@ -23,8 +23,10 @@ from aiohttp import (
 )
 
 from onedemo.app.http.auth import same_origin
-from onedemo.app.http.connections import Connection
-from onedemo.app.http.rate_limit import (
+from onedemo.app.http.sessions import RATER, SESSION
+from onedemo.app.http.viser_protocol import known
+from onedemo.app.network.connections import Connection
+from onedemo.app.network.rate_limit import (
     BYTES_AT_ONCE,
     BYTES_PER_S,
     LARGEST_MESSAGE,
@@ -35,8 +37,6 @@ from onedemo.app.http.rate_limit import (
     Bucket,
     Places,
 )
-from onedemo.app.http.sessions import RATER, SESSION
-from onedemo.app.http.viser_protocol import known
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 

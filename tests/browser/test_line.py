@@ -98,8 +98,8 @@ def stop(site):
 def start(site):
     """Another server on the same port, which knows nothing of pages that were open."""
     from onedemo.app.annotation.assignment import Again
-    from onedemo.app.http.bind import Listening
     from onedemo.app.http.server import Front
+    from onedemo.app.network.bind import Listening
     from onedemo.app.services.demo_images import Pictures
     from onedemo.app.ui.app import Page
 

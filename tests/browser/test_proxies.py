@@ -18,9 +18,9 @@ from browser.test_page import DESKTOP, press_and_wait, shown_clip, until
 from helpers.beside_playwright import run
 from onedemo.app.cli.main import main
 from onedemo.app.http import viser_proxy
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
+from onedemo.app.network.bind import Listening
 
 pytestmark = pytest.mark.seam
 

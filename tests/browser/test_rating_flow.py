@@ -399,9 +399,9 @@ def test_everything_can_be_done_with_the_keyboard_and_the_focus_is_seen(chromium
 
 
 def test_undo_outlives_a_reload_a_new_browser_and_a_restart(chromium, site):
-    from onedemo.app.http.bind import Listening
     from onedemo.app.http.server import Front
     from onedemo.app.http.tokens import issue_link, read_secret
+    from onedemo.app.network.bind import Listening
     from onedemo.app.services.demo_images import Pictures
     from onedemo.app.ui.app import Page
 

@@ -36,9 +36,9 @@ from data.videos import KINDS
 
 from helpers.fake_trainer import StandIn
 from onedemo.app.annotation.assignment import Again
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
+from onedemo.app.network.bind import Listening
 from onedemo.app.services.demo_images import Pictures
 from onedemo.app.ui.app import Page
 from onedemo.demos.library import import_video

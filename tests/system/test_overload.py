@@ -15,7 +15,7 @@ import pytest
 from helpers.beside_playwright import run
 from load.annotators import browser_session, open_tab
 from onedemo.app.http import server
-from onedemo.app.http.rate_limit import ACTIONS_WAITING, MESSAGES_AT_ONCE, PRESSES_AT_ONCE
+from onedemo.app.network.rate_limit import ACTIONS_WAITING, MESSAGES_AT_ONCE, PRESSES_AT_ONCE
 
 pytestmark = pytest.mark.seam
 

@@ -10,9 +10,9 @@ from aiohttp import web
 from helpers.beside_playwright import run
 from onedemo.app.http import uploads
 from onedemo.app.http.auth import PAGE_HEADER, AccessControl, Route
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.http.uploads import Uploads
+from onedemo.app.network.bind import Listening
 from onedemo.core.directories import Workshop
 from onedemo.demos.library import find_demo, read_frames
 from onedemo.storage.store import Store

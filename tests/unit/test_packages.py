@@ -24,7 +24,7 @@ ORDER = (
     "training",
     "baselines",
     "experiments",
-    "app.annotation app.templates",
+    "app.annotation app.templates app.network",
     "app.dataset app.services app.admin",
     "app.http",
     "app.ui",

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from onedemo.storage.database import Database, now
-from onedemo.storage.schema import STEPS
 from onedemo.types import Segment
 
 RATING_COLUMNS = (
@@ -28,8 +27,6 @@ HISTORY_COLUMNS = (
 """Of an event that does not hold any more, or is about a rater, in order."""
 LOOKED_BACK = 400
 """Events of a rater among which what may be taken back is looked for: every open page asks twice a second."""
-_WITHDRAWN = ("withdrawn",) if max(STEPS) > 6 else ()
-"""Column of ``events`` since schema 7: why a researcher took a rating back."""
 MOST_REASON = 200
 """Characters of the reason for a skip, or why a rating was withdrawn."""
 
@@ -434,8 +431,7 @@ class Ratings:
         return self._database.stream(
             "SELECT e.id, e.clip_id, NULL, COALESCE(e.run, c.run), p.name, e.kind, e.value, e.repeat,"
             " ROUND(e.mark_from * r.step_seconds, 6), ROUND(e.mark_to * r.step_seconds, 6), e.reason,"
-            " e.snapshot, e.predicted, e.latency_ms, e.created_at, b.name,"
-            f" {'e.withdrawn' if _WITHDRAWN else 'NULL'}"
+            " e.snapshot, e.predicted, e.latency_ms, e.created_at, b.name, e.withdrawn"
             " FROM events e LEFT JOIN clips c ON c.id = e.clip_id"
             " JOIN runs r ON r.id = COALESCE(e.run, c.run) JOIN raters p ON p.id = e.rater_id"
             " LEFT JOIN raters b ON b.id = e.by_id"
@@ -453,7 +449,7 @@ class Ratings:
         """
         names = (
             "id", "clip_id", "rater_id", "kind", "value", "repeat", "reason", "snapshot", "predicted",
-            "latency_ms", "run", "by_id", "created_at", *_WITHDRAWN,
+            "latency_ms", "run", "by_id", "created_at", "withdrawn",
         )  # fmt: skip
         with self._database.transaction() as db:
             db.execute(

@@ -18,9 +18,9 @@ from onedemo.app.annotation.presses import PageGone
 from onedemo.app.cli.main import main
 from onedemo.app.http import assets, viser_proxy
 from onedemo.app.http.auth import PAGE_HEADER
-from onedemo.app.http.bind import Listening
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, write_address
+from onedemo.app.network.bind import Listening
 from onedemo.errors import UserError
 from onedemo.storage.accounts import MOST_SESSIONS
 from onedemo.storage.database import now
@@ -49,8 +49,14 @@ class Behind:
 @pytest.fixture
 def store(tmp_path):
     with closing(Store(tmp_path)) as store:
-        store.database.rows("PRAGMA synchronous = OFF")
+        store.database._db.execute("PRAGMA synchronous = OFF")
         yield store
+
+
+def write(store, sql, values=()):
+    """What only time or another program does."""
+    with store.database.transaction() as db:
+        db.execute(sql, values)
 
 
 class Browser:
@@ -193,7 +199,7 @@ def test_a_page_is_told_why_its_session_ended(store, ending, why):
         async with front(store) as door, browser(door) as one:
             await one.get(link_of(store, door.url, "ann"))
             alive = await one.get("/r/1/session")
-            store.database.rows(ending)
+            write(store, ending)
             return alive, await one.get("/r/1/session")
 
     alive, ended = run(go())
@@ -249,9 +255,9 @@ def test_sessions_of_a_link_are_bounded_and_those_in_use_stay(store):
     assert len(sessions) == MOST_SESSIONS
     assert "in use" in sessions and "not in use" not in sessions and f"s{MOST_SESSIONS + 49}" in sessions
     # What ended a week ago goes; until then a page can be told why.
-    store.database.rows("UPDATE tokens SET expires_at = '2020-01-01T00:00:00.000Z' WHERE hash = 's90'")
-    store.database.rows("UPDATE tokens SET revoked_at = '2020-01-01T00:00:00.000Z' WHERE hash = 's91'")
-    store.database.rows("UPDATE tokens SET revoked_at = ? WHERE hash = 's92'", (now(),))
+    write(store, "UPDATE tokens SET expires_at = '2020-01-01T00:00:00.000Z' WHERE hash = 's90'")
+    write(store, "UPDATE tokens SET revoked_at = '2020-01-01T00:00:00.000Z' WHERE hash = 's91'")
+    write(store, "UPDATE tokens SET revoked_at = ? WHERE hash = 's92'", (now(),))
     store.accounts.open_link(token, "new")
     assert [store.accounts.session_state(name) for name in ("s90", "s91", "s92", "new")] == [
         None, None, "revoked", "open",
@@ -329,9 +335,9 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
                         for origin in ("http://elsewhere.example", "null")
                     ],
                 ]
-                assert {answer.status for answer in refused} <= {400, 403, 409}, path
+                assert {answer.status for answer in refused} <= {400, 403, 409, 415}, path
             press = {"press": "skip", "clip": 1, "id": "a", "page": "another"}
-            assert (await one.post("/r/1/press", body=press)).status == 409
+            assert (await one.post("/r/1/press", body=press)).status == 410
             assert door.behind.trainer.paused == 0
             assert (await one.post("/r/1/do")).status == 204
             assert door.behind.trainer.paused == 1

@@ -12,11 +12,11 @@ from contextlib import asynccontextmanager
 import pytest
 from aiohttp import web
 
-from onedemo.app.http import connections, refusals
-from onedemo.app.http.bind import Listening
-from onedemo.app.http.connections import Connections, Crowd, Limits
-from onedemo.app.http.rate_limit import Bucket, Buckets
-from onedemo.app.http.refusals import Refusals, read_body, read_json
+from onedemo.app.network import connections, refusals
+from onedemo.app.network.bind import Listening
+from onedemo.app.network.connections import Connections, Crowd, Limits
+from onedemo.app.network.rate_limit import Bucket, Buckets
+from onedemo.app.network.refusals import Refusals, read_body, read_json
 
 SMALL = Limits(strangers=12, strangers_each=4, members=12, members_each=8, pages=4)
 GET = b"GET /hello HTTP/1.1\r\nHost: x\r\n%s\r\n"

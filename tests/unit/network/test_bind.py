@@ -6,7 +6,7 @@ import pytest
 from aiohttp.test_utils import make_mocked_request
 from multidict import CIMultiDict
 
-from onedemo.app.http.bind import Listening, network
+from onedemo.app.network.bind import Listening, network
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from typing import Generic, TypeVar
 
 from aiohttp import web
 
-from onedemo.app.http.bind import network
-from onedemo.app.http.rate_limit import MOST_PAGES, Bucket
+from onedemo.app.network.bind import network
+from onedemo.app.network.rate_limit import MOST_PAGES, Bucket
 
 log = logging.getLogger("onedemo.page")
 
@@ -173,7 +173,7 @@ class Connection(web.RequestHandler):
             loop=loop,
             keepalive_timeout=KEEP_ALIVE_S,
             access_log=None,  # type: ignore[arg-type]
-            auto_decompress=False,  # nothing is inflated: see ``onedemo.app.http.refusals``
+            auto_decompress=False,  # nothing is inflated: see ``onedemo.app.network.refusals``
             lingering_time=2.0,
         )
         self._held, self._wire, self._clock, self._head = held, wire, loop.time, head

@@ -17,9 +17,9 @@ import msgspec
 from aiohttp import web
 from aiohttp.http import HttpProcessingError
 
-from onedemo.app.http.bind import Listening
-from onedemo.app.http.connections import Connection
-from onedemo.app.http.rate_limit import Buckets
+from onedemo.app.network.bind import Listening
+from onedemo.app.network.connections import Connection
+from onedemo.app.network.rate_limit import Buckets
 
 log = logging.getLogger("onedemo.page")
 
