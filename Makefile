@@ -57,7 +57,7 @@ soak: .venv/.installed-test
 bench: .venv/.installed
 	$(BIN)/python -m pip install --quiet --editable '.[bench]'
 	$(BIN)/onedemo bench speed --json speed.json --out speed-report
-	PYTHONPATH=tests $(BIN)/onedemo bench speed --part load.data --part load.product --part load.crowd \
+	PYTHONPATH=tests $(BIN)/onedemo bench speed --part load.dataset --part load.product --part load.crowd \
 	  --part load.painted --json speed-server.json --out speed-report/server
 
 clean:

@@ -275,4 +275,4 @@ def test_any_rating_is_looked_at_and_withdrawn_with_a_reason(chromium, site):
         assert not review.locator("[data-withdraw]").is_visible()
     said = [line for _, who, what, line in store.audit.lines() if (who, what) == ("ada", "withdraw")]
     assert len(said) == 1 and "pressed 5" in said[0] and "rating 1" in said[0]
-    assert "| 1 | 1 | Ann | 5 | <b>pressed 5</b> by mistake |" in card(store, run)
+    assert "| 1 | 1 | Ann | 5 | &lt;b&gt;pressed 5&lt;/b&gt; by mistake |" in card(store, run)

@@ -75,6 +75,7 @@ class StandIn:
         self.store.runs.add(
             run=self.run, demo=self.demo.name, demo_sha256="0" * 64, seed=0, config="", version="0"
         )
+        self.demo.path.touch()
         self.frames = drawn_frames(DEMO_FRAMES)
         self._lock = threading.Lock()
         self._status = Status(

@@ -74,17 +74,12 @@ def test_actions_that_take_long_are_few_and_hinder_nobody_who_rates(site):
             ada = await open_tab(session, site.links["researcher"])
             bo = await open_tab(session, site.links["annotator"])
             await bo.until(lambda: bo.clip, "a clip")
-            headers = ada.headers | {"Origin": site.url}
-            asked = [
-                asyncio.ensure_future(
-                    ask(session, f"{ada.address}/do", "POST", data=b'{"do": "pause run"}', headers=headers)
-                )
-                for _ in range(ACTIONS_WAITING + 8)
-            ]
+            await ada.until(lambda: ada.token, "a page")
+            asked = [asyncio.ensure_future(ada.do(do="pause run")) for _ in range(ACTIONS_WAITING + 8)]
             done, _ = await asyncio.wait(asked, timeout=20, return_when=asyncio.FIRST_COMPLETED)
             await bo.rate(3)
             go_on.__exit__(None, None, None)
-            said = [status for status, _ in await asyncio.gather(*asked)]
+            said = await asyncio.gather(*asked)
             for tab in (ada, bo):
                 await tab.close()
             assert done
@@ -235,6 +230,6 @@ def test_the_port_closes_soon_whatever_is_under_way(site):
             await ada.close()
             return taken
 
-    with stuck(site.trainer, "rollout_file"):
+    with stuck(site.trainer, "rollout_picture"):
         assert run(go()) < 9
     assert not site.front._thread.is_alive()

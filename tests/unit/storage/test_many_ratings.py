@@ -5,7 +5,7 @@ import tracemalloc
 
 import pytest
 
-from load.data import _RUN, _ask_all, _begin, _fill, _press
+from load.dataset import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
 from onedemo.app.dataset.ratings_csv import csv_blocks
 from onedemo.app.ui.data_tab import data_html
