@@ -20,9 +20,9 @@ const line = (() => {
   // Viser dims what it has drawn while it is not connected (DisconnectedGate).
   const DIMMED = 'div[style*="pointer-events: none"][style*="opacity: 0.5"]';
   const ENDED = "Your link was revoked, or its time is over. Please ask for another one.";
-  const IN_PROXY = new Set([502, 504]); // the server is down, says the proxy before it
+  const IN_PROXY = new Set([502, 503, 504]); // the server is down, says the proxy before it
 
-  const began = performance.now();
+  let began = Infinity; // when the page itself was there
   const grace = settings.graceMs * (1 + Math.random()); // not all pages at once
   const waiting = []; // of presses: called when the server answers, or will never
   let busy = 0; // requests that a reload would break
@@ -41,7 +41,7 @@ const line = (() => {
   }
 
   function fromServer(answer) {
-    if (IN_PROXY.has(answer.status)) throw new TypeError("the server behind the proxy does not answer");
+    if (IN_PROXY.has(answer.status) && !answer.headers.has("X-Onedemo")) throw new TypeError("the server behind the proxy does not answer");
     return answer;
   }
 
@@ -54,6 +54,7 @@ const line = (() => {
     askedAt = performance.now();
     try {
       const answer = await request("session", { cache: "no-store" });
+      if (answer.status !== 204 && answer.status !== 401) throw new TypeError("the server cannot say");
       down = false;
       if (answer.status === 401) end((await reason(answer)) || ENDED);
     } catch (error) {
@@ -118,7 +119,7 @@ const line = (() => {
   }
 
   function unconnected() {
-    card("The page is but its live connection is not", [
+    card("The page is here, but its live connection is not", [
       "If a proxy stands before onedemo, it must pass WebSockets and the Host header on: " +
         "docs/remote-access.md has the lines for nginx and Caddy.",
       "Without a proxy: close other pages of onedemo in this browser, then reload.",
@@ -191,6 +192,7 @@ const line = (() => {
   }
 
   document.addEventListener("DOMContentLoaded", () => {
+    began = performance.now();
     setInterval(look, settings.lookMs);
     for (const event of ["online", "focus"])
       window.addEventListener(event, () => {

@@ -60,6 +60,7 @@ const page = (() => {
       method: "POST",
       headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(what),
+      ...(where === "do" && { signal: null }), // a change of runs may wait for an iteration
       ...options,
     });
     if (answer.status === 401) {
@@ -283,7 +284,7 @@ const page = (() => {
     else if ("mark" in data) local("m");
     else if ("help" in data) local("?");
     else if ("signOut" in data)
-      post("signout", {}).then(
+      queue.then(() => post("signout", {})).then(
         (answer) => location.assign(answer.url),
         (error) => say(error.message),
       );

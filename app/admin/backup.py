@@ -62,7 +62,7 @@ def back_up(data_dir: Path, file: Path) -> Saved:
         checkpoints = {
             path: stack.enter_context(path.open("rb")) for path in data_dir.glob("runs/*/checkpoint.pt")
         }
-        place = stack.enter_context(Workshop(file.absolute().parent, f".{file.name}."))
+        place = stack.enter_context(Workshop(file.absolute().parent, f".{file.name}.onedemo-half-"))
         ratings, snapshots = _copy_database(data_dir / FILE_NAME, place / FILE_NAME)
         half, left_out = place / "archive", []
         with half.open("wb") as out, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as archive:

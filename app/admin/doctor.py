@@ -183,7 +183,8 @@ def _files(data_dir: Path) -> Iterator[Finding]:
         runs = [run for (run,) in db.execute("SELECT id FROM runs")]
         snapshots = db.execute("SELECT run, number FROM snapshots").fetchall()
         waiting = db.execute(
-            "SELECT run, id FROM clips WHERE state = 'ready' AND id NOT IN (SELECT clip_id FROM events)"
+            "SELECT run, id FROM clips WHERE state = 'ready'"
+            " AND id NOT IN (SELECT clip_id FROM events WHERE clip_id IS NOT NULL)"
         ).fetchall()
     root = data_dir / "runs"
     for run in runs:

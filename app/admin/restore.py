@@ -51,7 +51,7 @@ def restore(file: Path, data_dir: Path) -> dict[str, int]:
             digests = read_manifest(archive, file)
             _check_room(file, place)
             make_directory(place)
-            with Workshop(place, f".{data_dir.name}.") as half:
+            with Workshop(place, f".{data_dir.name}.onedemo-half-") as half:
                 return _restore(archive, file, digests, half, data_dir.absolute())
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise UserError(f"{file} is damaged, or no backup: {error}") from None

@@ -7,7 +7,9 @@ none is served to nobody.
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
 from typing import Literal, NamedTuple
 from urllib.parse import parse_qs
 
@@ -189,7 +191,10 @@ class AccessControl:
         )
         if opened is None:
             return await self._refuse(request, token, link)
-        await asyncio.to_thread(self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}")
+        with suppress(sqlite3.Error):  # the link is used, so its owner is let in
+            await asyncio.to_thread(
+                self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}"
+            )
         response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id))
         self.sessions.put(request, response, opened.rater.id, session)
         return response

@@ -50,6 +50,8 @@ _CLOSE_S = 1.0
 """What requests that are being answered have when the port closes."""
 _HEALTH_S = 5.0
 """A trainer that has not said by then how it is, is not well."""
+_THREADS = 32
+"""For whatever may take long: exports, uploads, links. They wait for the disk, not for each other."""
 _PRESSING_THREADS = 8
 _TLS_ALONE = {"Strict-Transport-Security": "max-age=31536000"}
 
@@ -210,7 +212,7 @@ class Front:
 
     def _run(self, ready: threading.Event, failure: list[BaseException]) -> None:
         asyncio.set_event_loop(self._loop)
-        self._loop.set_default_executor(threads := ThreadPoolExecutor(thread_name_prefix="onedemo-front"))
+        self._loop.set_default_executor(threads := ThreadPoolExecutor(_THREADS, "onedemo-front"))
         try:
             self._loop.run_until_complete(self._serve(ready))
         except Exception as error:  # whatever it is: the caller must not believe the port open
@@ -220,7 +222,8 @@ class Front:
             for task in (left := asyncio.all_tasks(self._loop)):
                 task.cancel()
             self._loop.run_until_complete(asyncio.wait(left, timeout=_CLOSE_S) if left else asyncio.sleep(0))
-            pools = (threads, self._pressing, self._acting, self._looking)
+            sessions = self._access.sessions.threads
+            pools = (threads, sessions, self._pressing, self._acting, self._looking)
             ends = [threading.Thread(target=pool.shutdown, daemon=True) for pool in pools]
             for end in ends:
                 end.start()
@@ -250,6 +253,7 @@ class Front:
             await runner.cleanup()
 
     async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
+        response.headers["X-Onedemo"] = "1"  # a proxy's own answer is without it
         response.headers["Server"] = "onedemo"  # else aiohttp tells its version, and Python's
         for name, value in SECURITY_HEADERS.items():
             response.headers.setdefault(name, value)

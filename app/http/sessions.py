@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 from aiohttp import web
 
@@ -22,6 +24,8 @@ from onedemo.types import Rater
 RATER = web.RequestKey("rater", Rater)
 SESSION = web.RequestKey("session", str)
 """The hash of the cookie's token."""
+_T = TypeVar("_T")
+_THREADS = 4
 PERSON = r"/r/{rater:\d{1,9}}"
 """Where everything of one person's page is."""
 
@@ -46,12 +50,14 @@ class Sessions:
 
     def __init__(self, store: Store, listening: Listening, port: Callable[[], int]) -> None:
         self._store, self._listening, self._port = store, listening, port
+        self.threads = ThreadPoolExecutor(_THREADS, "onedemo-session")
+        """Nothing else is done in them, so that nobody waits to be recognised."""
 
     async def recognise(self, request: web.Request) -> None:
         """Notes who asks; below ``/r/N`` that is N or nobody."""
         for token in self.tokens(request):
             session = hash_token(token)
-            rater = await asyncio.to_thread(self._store.accounts.rater_of, session, "session")
+            rater = await self._ask(self._store.accounts.rater_of, session, "session")
             if rater is not None and rater.id == _person(request, rater.id):
                 request[RATER], request[SESSION] = rater, session
                 return
@@ -79,7 +85,7 @@ class Sessions:
         if RATER in request:
             return web.Response(status=204)
         states = [
-            await asyncio.to_thread(self._store.accounts.session_state, hash_token(token))
+            await self._ask(self._store.accounts.session_state, hash_token(token))
             for token in self.tokens(request)
         ]
         known = next((state for state in states if state in _ENDED and state is not None), None)
@@ -88,7 +94,8 @@ class Sessions:
     async def sign_out(self, request: web.Request) -> web.StreamResponse:
         """Ends the session: here, and in this browser."""
         rater, session = request[RATER], request[SESSION]
-        await asyncio.to_thread(self._store.accounts.end_session, session)
+        for token in self.tokens(request):  # an older cookie may hold another session of the same person
+            await asyncio.to_thread(self._store.accounts.end_session, hash_token(token))
         await asyncio.to_thread(self._store.audit.note, rater.name, "signed out")
         response = web.HTTPSeeOther(f"{self._listening.base_path}/signed-out")
         (own, path), (last, everywhere) = self._both(rater.id)
@@ -96,6 +103,9 @@ class Sessions:
         if any(hash_token(token) == session for token in _values(request, last)):
             response.del_cookie(last, path=everywhere)
         return response
+
+    async def _ask(self, what: Callable[..., _T], *about: str) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self.threads, what, *about)
 
     def _both(self, rater: int) -> tuple[tuple[str, str], tuple[str, str]]:
         base = self._listening.base_path

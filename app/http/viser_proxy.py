@@ -10,6 +10,7 @@ import asyncio
 import logging
 import re
 import sqlite3
+from contextlib import suppress
 from typing import Protocol
 
 from aiohttp import (
@@ -187,12 +188,13 @@ class Proxy:
             self._store.accounts.note_use(sessions)
             try:
                 ended = await asyncio.to_thread(self._store.accounts.ended_sessions, sessions)
-                await asyncio.to_thread(self._store.audit.finish)
             except sqlite3.Error:  # locked, say: it is looked at again
                 continue
             for browser, session in tuple(self._sockets.items()):
                 if session in ended:
                     await browser.close(code=WSCloseCode.POLICY_VIOLATION, message=b"this session has ended")
+            with suppress(sqlite3.Error):  # what is left is written the next time
+                await asyncio.to_thread(self._store.audit.finish)
 
 
 async def _pump(inside: ClientWebSocketResponse, outside: web.WebSocketResponse) -> None:

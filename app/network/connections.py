@@ -23,7 +23,7 @@ from typing import Generic, TypeVar
 from aiohttp import web
 
 from onedemo.app.network.bind import network
-from onedemo.app.network.rate_limit import MOST_PAGES, Bucket
+from onedemo.app.network.rate_limit import MOST_PAGES, MOST_PAGES_EACH, Bucket
 
 log = logging.getLogger("onedemo.page")
 
@@ -76,9 +76,9 @@ class Limits:
         strangers = min(512, descriptors // 8)
         return cls(
             strangers=strangers,
-            strangers_each=min(64, strangers // 2) if addresses_known else strangers,
+            strangers_each=min(256, strangers // 2) if addresses_known else strangers,
             members=min(2048, descriptors // 4),
-            members_each=64,
+            members_each=8 * MOST_PAGES_EACH,  # a browser has six, and the page's own
             pages=min(MOST_PAGES, descriptors // 8),
         )
 
@@ -92,9 +92,11 @@ def raise_descriptors() -> int:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     unlimited = resource.RLIM_INFINITY
     wanted = _WANTED_DESCRIPTORS if hard == unlimited else min(hard, _WANTED_DESCRIPTORS)
-    if soft != unlimited and soft < wanted:
-        with suppress(ValueError, OSError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    for most in (wanted, 10_240, 4096):  # some systems name a limit that they do not grant
+        if soft != unlimited and soft < most <= wanted:
+            with suppress(ValueError, OSError):
+                resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+                break
     soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return _WANTED_DESCRIPTORS if soft == unlimited else soft
 
@@ -183,17 +185,18 @@ class Connection(web.RequestHandler):
         self.whose: Hashable = address
         """The address, or the person's number once it is known."""
         self.stranger = True
+        self._gone = False
         self.heard_at = loop.time()
 
     def heard(self) -> None:
         """A whole header has come."""
-        if self.stranger:
+        if self.stranger and not self._gone:
             self.heard_at = self._clock()
             self._held.enter(self)
 
     def belongs_to(self, person: int) -> None:
         """Its request has shown a session of this person."""
-        if self.stranger or self.whose != person:
+        if not self._gone and (self.stranger or self.whose != person):
             self._held.move(self, person)
 
     def allow(self, bucket: Bucket) -> None:
@@ -233,6 +236,7 @@ class Connection(web.RequestHandler):
 
     def connection_lost(self, exc: BaseException | None) -> None:
         """It has ended."""
+        self._gone = True  # its request may still be answered
         self._held.leave(self)
         super().connection_lost(exc)
 

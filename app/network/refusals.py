@@ -58,7 +58,7 @@ class Refusals:
             connection.heard()
         try:
             check_headers(request)
-            async with asyncio.timeout(LOGIN_S if request.path == "/login" else None):
+            async with asyncio.timeout(LOGIN_S if request.path.endswith("/login") else None):
                 response = await handler(request)
         except web.HTTPException as answer:
             response = answer

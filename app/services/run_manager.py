@@ -12,7 +12,7 @@ from pathlib import Path
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
 from onedemo.core.files import hold
 from onedemo.core.log_limit import LogLimit
-from onedemo.demos.library import find_demo
+from onedemo.demos.library import find_demo, list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import Drawing
 from onedemo.reward.model import Snapshot, check_start
@@ -90,7 +90,10 @@ class Study:
             known = {entry["id"]: entry for entry in self._store.runs.all()}
             if run not in known:
                 raise UserError(f"no run {run!r}; there are: {', '.join(known)}")
-            demo = find_demo(known[run]["demo"], self._data_dir / "demos")
+            place, sha256 = self._data_dir / "demos", known[run]["demo_sha256"]
+            # Of the same pictures, whatever its name is by now.
+            same = next((demo for demo in list_demos(place) if demo.sha256 == sha256), None)
+            demo = same or find_demo(known[run]["demo"], place)
             found = find_run(self._store, self._data_dir, demo, name=run, wanted=None)
             assert found is not None
             self._switch(run, demo, found[1])

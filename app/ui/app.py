@@ -17,7 +17,7 @@ from typing import Any
 import rich
 import viser
 
-from onedemo.app.annotation.assignment import Again, Assignment
+from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment
 from onedemo.app.annotation.presses import PageGone, Press, Rate, Skip
 from onedemo.app.annotation.rating_session import GUARD_SECONDS
 from onedemo.app.annotation.tutorial import Lesson
@@ -36,7 +36,7 @@ log = logging.getLogger("onedemo.page")
 
 TICK_SECONDS = 0.5
 """How often counters, waiting states and curves are looked at."""
-_LOOKED_BACK = 20
+_LOOKED_BACK = REPEAT_AFTER
 """Events of a rater among which is one that was given at a page that has gone."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import glob
 import os
 import shutil
 import tempfile
@@ -78,7 +79,7 @@ class Workshop:
 
 def clear_left_over(place: Path, prefix: str) -> None:
     """Removes files and directories of that prefix which no living process holds with ``flock``."""
-    for left in place.glob(f"{prefix}*"):
+    for left in place.glob(f"{glob.escape(prefix)}*"):
         with suppress(OSError):
             handle = os.open(left, os.O_RDONLY | os.O_NOFOLLOW)
             try:

@@ -39,7 +39,10 @@ class LogLimit(logging.Filter):
         written = left >= 1
         self._places[place] = (left - written, now, 0 if written else out + 1)
         if written:
-            text = record.getMessage()
+            try:
+                text = record.getMessage()
+            except Exception:  # wrongly formatted: the handler tells of it
+                return True
             shown = text if len(text) <= LONGEST else f"{text[:LONGEST]} (and so on)"
             record.msg, record.args = f"{shown} ({out} more like this)" if out else shown, None
         return written

@@ -12,6 +12,7 @@ import os
 import sys
 import threading
 import time
+from contextlib import suppress
 from typing import Literal
 
 GL_OFF = ("disable", "disabled", "off", "false", "0")
@@ -63,7 +64,8 @@ def end_within(seconds: float, code: int = 0) -> None:
 
     def end() -> None:
         time.sleep(seconds)
-        sys.stdout.flush()
+        with suppress(Exception):  # whoever read it may have gone
+            sys.stdout.flush()
         os._exit(code)
 
     threading.Thread(target=end, name="onedemo-end", daemon=True).start()

@@ -98,7 +98,7 @@ class DrawingProcess:
         self._pipe, theirs = Pipe()
         with theirs:
             self._child = subprocess.Popen(
-                [sys.executable, "-m", "onedemo.render.drawing_process", str(theirs.fileno())],
+                [sys.executable, "-P", "-m", "onedemo.render.drawing_process", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -114,7 +114,7 @@ class DrawingProcess:
         self, child: subprocess.Popen[bytes], pipe: Connection, waiting: dict[int, Future[Any]]
     ) -> None:
         with pipe:
-            with suppress(EOFError, OSError):
+            try:
                 while True:
                     number, result, error = pickle.loads(pipe.recv_bytes())
                     future = waiting.pop(number)
@@ -124,6 +124,11 @@ class DrawingProcess:
                         future.set_result(result)
                     else:
                         future.set_exception(error)
+            except (EOFError, OSError):
+                pass
+            except Exception:  # whatever was said: the next job begins another process
+                log.exception("an answer of the process that draws pictures cannot be read")
+                child.kill()
             code = child.wait()
             with self._lock:  # nothing is added any more
                 self._dead = True
@@ -148,6 +153,8 @@ def main(descriptor: int) -> None:
         error = drawn.exception()
         try:
             data = pickle.dumps((number, None if error else drawn.result(), error))
+            if error is not None:
+                pickle.loads(data)  # not every error that can be pickled can be read again
         except Exception as unsent:  # what cannot be pickled is told in words
             data = pickle.dumps((number, None, RuntimeError(in_words(error or unsent))))
         with turn, suppress(OSError):

@@ -231,7 +231,8 @@ def check_start(start: Snapshot, config: PredictorConfig) -> None:
 
 def expected(probabilities: np.ndarray) -> np.ndarray:
     """The expected rating, ``sum_k k p(k)``, of probabilities (..., 5): (...)."""
-    return probabilities @ np.arange(1, CLASSES + 1, dtype=np.float32)
+    with np.errstate(invalid="ignore"):  # BLAS may set that flag by what lies beside an array of five
+        return probabilities @ np.arange(1, CLASSES + 1, dtype=np.float32)
 
 
 def visual_inputs(features: np.ndarray, dims: int) -> np.ndarray:

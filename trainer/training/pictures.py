@@ -218,6 +218,8 @@ def pictures_of(files: RunDirectory) -> list[tuple[Path, int, float]]:
     found = []
     for pattern in ("clips/*.jpg", "pairs/*.jpg", "rollouts/*.jpg", "rollouts/*.webm"):
         for path in files.path.glob(pattern):
+            if path.name.startswith("."):  # being written
+                continue
             try:
                 there = path.stat()
             except FileNotFoundError:  # being written, or deleted meanwhile

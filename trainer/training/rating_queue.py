@@ -61,7 +61,7 @@ class RatingQueue:
     def __init__(self, store: Store, run: str, config: RunConfig, simulated: Simulated | None) -> None:
         self._store, self._run, self._config, self._simulated = store, run, config, simulated
         self._declined = 0
-        self._seen = (0, 0)
+        self._seen = (-2, 0)
         self._pace = 0
         self.clips: ClipMaker | None = None
         """Draws clips for people; None if nobody looks."""
@@ -168,9 +168,9 @@ class RatingQueue:
     def _ratings_an_iteration(self, iteration: int, given: int) -> int:
         """How many came during the last one: clips are cut between two, so as many must wait at the least."""
         before, given_before = self._seen
+        self._seen = (iteration, given)  # the last look before an iteration is its beginning
         if iteration != before:
             self._pace = given - given_before if iteration == before + 1 else 0
-            self._seen = (iteration, given)
         return self._pace
 
     def _answer(self, simulated: Simulated, clips: list[Clip], segments: list[Segment]) -> bool:

@@ -51,7 +51,10 @@ def find_run(
     Raises:
         UserError: If the run has other settings or was made with another video.
     """
-    found = [r for r in store.runs.all() if (r["id"] == name if name else r["demo"] == demo.name)]
+    runs = store.runs.all()
+    found = [r for r in runs if (r["id"] == name if name else r["demo"] == demo.name)]
+    if not found and name is None:  # the demo was renamed, and the database does not know
+        found = [r for r in runs if r["demo_sha256"] == demo.sha256]
     if not found:
         return None
     run = found[-1]

@@ -56,10 +56,10 @@ def test_the_journal_of_the_attack_is_a_real_one(good, tmp_path):
 
 
 def test_a_good_one_is_there_afterwards_for_its_owner_alone(good, tmp_path):
-    with Workshop(tmp_path, ".again.") as half:  # of somebody who is still at work
-        shutil.copytree(half, tmp_path / ".again.killed")  # of somebody who is not
+    with Workshop(tmp_path, ".again.onedemo-half-") as half:  # of somebody who is still at work
+        shutil.copytree(half, tmp_path / ".again.onedemo-half-killed")  # of somebody who is not
         assert restore(good, tmp_path / "again") == {"files": 3, "ratings": 1}
-        assert half.exists() and not (tmp_path / ".again.killed").exists()
+        assert half.exists() and not (tmp_path / ".again.onedemo-half-killed").exists()
     for path in (tmp_path / "again", *(tmp_path / "again").rglob("*")):
         assert not stat.S_IMODE(path.stat().st_mode) & 0o077, path
 

@@ -221,5 +221,5 @@ def test_as_many_clips_wait_as_people_rate_while_the_robot_practises_once():
     paces = [
         queue._ratings_an_iteration(*seen) for seen in ((0, 0), (0, 30), (1, 40), (1, 90), (2, 100), (3, 100))
     ]
-    assert paces == [0, 0, 40, 40, 60, 0]
+    assert paces == [0, 0, 10, 10, 10, 0]  # not those given before, or while it was paused
     assert queue._ratings_an_iteration(9, 500) == 0  # a run that was resumed

@@ -162,3 +162,9 @@ def test_a_taken_name(store, tmp_path):
     add_run(store, tmp_path, DEMO, load_config(), name="mine")
     with pytest.raises(UserError, match="'mine' exists already"):
         add_run(store, tmp_path, DEMO, load_config(), name="mine")
+
+
+def test_a_run_is_found_although_its_demo_has_another_name(store, tmp_path):
+    run = add_run(store, tmp_path, DEMO, load_config(), name=None)
+    renamed = replace(DEMO, name="renamed")
+    assert find_run(store, tmp_path, renamed, name=None, wanted=None) == (run, load_config())
