@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from helpers.paths import ROOT
 from onedemo.errors import UserError
 from onedemo.render.drawing_process import DrawingProcess
 from onedemo.render.renderer import Renderer
@@ -34,8 +35,12 @@ def nothing_to_send(renderer):
 
 @pytest.fixture(scope="module")
 def drawing():
-    with DrawingProcess() as process:
-        yield process
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(
+            "PYTHONPATH", os.pathsep.join((str(ROOT), str(ROOT / "tests")))
+        )  # the process takes nothing from the current directory
+        with DrawingProcess() as process:
+            yield process
 
 
 def test_it_draws_what_the_renderer_of_this_process_would(drawing):
