@@ -12,7 +12,7 @@ from typing import Any
 
 from onedemo.app.dataset.ratings_csv import armed
 from onedemo.errors import UserError
-from onedemo.storage.ratings import MOST_REASON
+from onedemo.storage.rating_records import MOST_REASON
 
 _MOST = 10**12
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?Z", re.ASCII)

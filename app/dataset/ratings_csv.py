@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
 
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 

@@ -31,7 +31,8 @@ from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.network.bind import Listening
-from onedemo.app.network.connections import Connections, Limits, raise_descriptors
+from onedemo.app.network.capacity import Limits, raise_descriptors
+from onedemo.app.network.connections import Connections
 from onedemo.app.network.rate_limit import (
     ACTIONS_WAITING,
     PRESSES_AT_ONCE,

@@ -21,7 +21,7 @@ from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.network.bind import Listening
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam
