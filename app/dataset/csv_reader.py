@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from onedemo.app.dataset.ratings_csv import armed
+from onedemo.app.dataset.csv_writer import armed
 from onedemo.errors import UserError
 from onedemo.storage.rating_records import MOST_REASON
 

@@ -1,4 +1,4 @@
-"""Ratings as CSV, in pieces, safe to open in a spreadsheet."""
+"""Rows as CSV, in blocks, safe to open in a spreadsheet; ``csv_reader`` reads them back."""
 
 from __future__ import annotations
 
