@@ -66,11 +66,11 @@ def raise_descriptors() -> int:
 
 
 class Crowd(Generic[Item]):
-    """Items by whose they are: so many in all, so many of each. Whoever comes is let in; another leaves.
+    """Items by owner, with a limit in all and for each. A newcomer is always let in; an older one leaves.
 
     Args:
         most: In all.
-        most_each: Of one.
+        most_each: Of one owner.
     """
 
     def __init__(self, most: int, most_each: int) -> None:

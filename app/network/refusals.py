@@ -1,4 +1,4 @@
-"""The one place that turns whatever somebody sends into a short answer: 4xx for what is wrong with it.
+"""The one place that turns what is wrong with a request into a short answer, 4xx.
 
 Nothing of a body is read before the right is checked, nothing is ever inflated, and what nobody read ends
 the connection.
@@ -76,7 +76,7 @@ class Refusals:
 
     @web.middleware
     async def within(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Around the handlers: whoever gets here may be here."""
+        """Around the handlers: access has been checked by now."""
         person = self._person(request)
         if person is not None and isinstance(request.protocol, Connection):
             request.protocol.belongs_to(person)
