@@ -1,10 +1,11 @@
-"""Connections of the front: who may hold how many, for how long, and how much may come over one.
+"""Connections of the front: in which order they get in, how long they last, how much may come over one.
 
 Whoever comes waits in a lobby, which costs a socket and nothing else, until a whole header has come. Then the
 connection is aiohttp's, and, until its request has shown a session, a stranger's. Lobby and strangers have
 fixed numbers of places; when those are taken, the oldest connection of the address that holds most of them
 ends. So a newcomer always gets in. One that shows a session counts as that person's from then on, whom
-strangers cannot crowd out. All places together are fewer than the file descriptors of the process.
+strangers cannot crowd out. How many places there are, fewer in all than the file descriptors of the process,
+is in ``onedemo.app.network.capacity``.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ KEEP_ALIVE_S = 75.0
 STALLED_S = 30.0
 """How long what was sent may go untaken."""
 HANDSHAKE_S = 10.0
+NOT_UNDERSTOOD = "This is no request that can be understood."
 _LOOK_S = 1.0
 _WAITING = 1024
 """Connections that the system holds until they are accepted."""
@@ -159,7 +161,7 @@ class Connection(web.RequestHandler):
         if status >= 500:
             response = super().handle_error(request, status, exc, message)
         else:
-            response = web.Response(status=status, text="This is no request that can be understood.")
+            response = web.Response(status=status, text=NOT_UNDERSTOOD)
             response.force_close()
         response.headers["Server"] = "onedemo"  # else aiohttp tells its version
         return response
