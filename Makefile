@@ -34,19 +34,19 @@ check: .venv/.installed-test
 	@rm -rf build/typed && mkdir -p build/typed && cp -R trainer build/typed/onedemo && cp -R app static build/typed/onedemo
 	$(BIN)/pyright --level error --pythonpath $(BIN)/python
 
-# What the tests do in seconds, for long: three quarters of an hour, and two hours. Tables of figures are left in promises/.
+# The long forms of the tests: chaos takes three quarters of an hour, soak two hours. Their tables of figures are left in promises/.
 chaos: .venv/.installed-test
 	@mkdir -p promises
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py \
 	  tests/browser/test_line.py
 	$(BIN)/python tests/data/videos.py --long
-	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/door.json
+	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/fuzz.json
 	PYTHONPATH=tests $(BIN)/python tests/load/attack_http.py --json promises/attack.json
 	PYTHONPATH=tests $(BIN)/python tests/load/kill_server.py --json promises/kill.json
 	PYTHONPATH=tests $(BIN)/python tests/load/hostile_archives.py --json promises/archives.json
 	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 120 --films 8 --json promises/films.json
 	PYTHONPATH=tests $(BIN)/python tests/load/drawn_server.py --seconds 1200 --json promises/drawn.json
-	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/door.json \
+	@$(BIN)/python tests/load/promises.py promises/chaos.md promises/kill.json promises/fuzz.json \
 	  promises/attack.json promises/archives.json promises/films.json promises/drawn.json
 
 soak: .venv/.installed-test

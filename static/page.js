@@ -60,7 +60,6 @@ const page = (() => {
       method: "POST",
       headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(what),
-      ...(where === "do" && { signal: null }), // a change of runs may wait for an iteration
       ...options,
     });
     if (answer.status === 401) {
@@ -71,6 +70,9 @@ const page = (() => {
     if (!answer.ok) throw new Refused(await answer.text());
     return answer;
   }
+
+  // What a researcher's button does; without a time limit, since a change of runs may wait for an iteration.
+  const act = (action, fields) => post("do", { do: action, ...fields }, { signal: null });
 
   // Why the last answer did not count, or not yet; it stays until the next one.
   function say(text, late = false) {
@@ -300,7 +302,7 @@ const page = (() => {
       button.disabled = true; // until the page is drawn anew
       const { do: action, ...fields } = data;
       if (fields.rater) fields.rater = Number(fields.rater);
-      post("do", { do: action, ...fields }).catch((error) => {
+      act(action, fields).catch((error) => {
         button.disabled = false;
         button.textContent = error.message;
       });
@@ -385,7 +387,7 @@ const page = (() => {
     const fields = Object.fromEntries(new FormData(form));
     for (const input of form.querySelectorAll("[type=number]")) fields[input.name] = Number(input.value);
     place.textContent = "One moment: the current run finishes its iteration first.";
-    post("do", { do: form.dataset.act, ...fields }).catch((error) => (place.textContent = error.message));
+    act(form.dataset.act, fields).catch((error) => (place.textContent = error.message));
   });
   // A video on its way: fetch tells nothing of how far it is, hence the older request.
   document.addEventListener("submit", (event) => {
@@ -465,5 +467,5 @@ const page = (() => {
     document.body.append(note);
   });
 
-  return { post };
+  return { act };
 })();

@@ -86,7 +86,7 @@
     const [button, note] = [form.querySelector("button"), form.closest("dialog").querySelector(".od-form-note")];
     button.disabled = true;
     page
-      .post("do", { do: "withdraw", rating: Number(form.elements.rating.value), reason: form.elements.reason.value })
+      .act("withdraw", { rating: Number(form.elements.rating.value), reason: form.elements.reason.value })
       .then(
         () => (form.closest("dialog").close(), load(place)),
         (error) => (note.textContent = error.message),

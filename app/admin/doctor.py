@@ -54,6 +54,7 @@ def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
         ("pictures", _pictures),
         ("image network", lambda: _encoder(data_dir)),
         ("disk", lambda: _disk(data_dir)),
+        ("privacy", lambda: _privacy(data_dir)),
     ]
     if (data_dir / FILE_NAME).exists():
         checks += [
@@ -120,6 +121,10 @@ def _disk(data_dir: Path) -> Iterator[Finding]:
         yield Finding("disk", True, f"{what}; a run needs about {needed / 1e6:,.0f} MB")
     if is_shared(there):
         yield Finding("disk", False, f"{ON_SHARED.format(there)} ({kind})")
+
+
+def _privacy(data_dir: Path) -> Iterator[Finding]:
+    """What other users of the computer could read."""
     if data_dir.exists() and data_dir.stat().st_mode & 0o077:
         yield Finding(
             "privacy", False, f"others on this computer can look into {data_dir}: chmod -R go-rwx {data_dir}"
@@ -222,11 +227,12 @@ def _files(data_dir: Path) -> Iterator[Finding]:
 
 def _demos(data_dir: Path) -> Iterator[Finding]:
     there = [path.parent for path in (data_dir / "demos").glob("*/demo.json")]
-    known = {demo.path.parent: demo for demo in list_demos(data_dir / "demos")}
+    demos = list_demos(data_dir / "demos")
+    known = {demo.path.parent: demo for demo in demos}
     broken = [path for path in there if path not in known or not is_whole(known[path])]
     with closing(_open(data_dir / FILE_NAME)) as db:
         wanted = db.execute("SELECT id, demo, demo_sha256 FROM runs").fetchall()
-    whole = {demo.sha256 for demo in list_demos(data_dir / "demos")}
+    whole = {demo.sha256 for demo in demos}
     lost = [(run, demo, sha256) for run, demo, sha256 in wanted if sha256 not in whole]
     for run, demo, sha256 in lost[:_NAMED]:
         yield Finding(

@@ -95,7 +95,7 @@ def check_contents(db: sqlite3.Connection) -> int:
     for table, columns in _NUMBERS.items():
         where = " OR ".join(f"typeof({column}) != 'integer'" for column in columns)
         if db.execute(f"SELECT 1 FROM {table} WHERE {where} LIMIT 1").fetchone():
-            raise UserError(f"a number in its table {table} is none")
+            raise UserError(f"its table {table} holds text in the place of a number")
     for (run,) in db.execute("SELECT id FROM runs"):
         check_run_name(run)
     return db.execute("SELECT COUNT(*) FROM ratings").fetchone()[0]
@@ -115,7 +115,7 @@ def faults_in_rows(db: sqlite3.Connection) -> Iterator[str]:
         no_time = f"SELECT COUNT(*) FROM {table} WHERE {column} NOT GLOB ?"
         (wrong,) = db.execute(no_time, (_TIME,)).fetchone()
         if wrong:
-            yield f"{wrong} times in {table} are none"
+            yield f"{wrong} times in {table} are not times"
     for table in ("snapshots", "iterations"):
         for run, number, stats in db.execute(f"SELECT run, number, stats FROM {table}"):
             try:

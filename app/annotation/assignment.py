@@ -13,7 +13,7 @@ import threading
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from onedemo.storage.ratings import Answered
+from onedemo.storage.rating_records import Answered
 
 LEASE_SECONDS = 120.0
 MOST_RATERS = 3

@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable
 
 from onedemo.app.annotation.assignment import Assignment, Seat
 from onedemo.app.annotation.rating_session import GUARD_SECONDS, AnsweredElsewhere
-from onedemo.storage.ratings import AlreadyAnswered
+from onedemo.storage.rating_records import AlreadyAnswered
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 

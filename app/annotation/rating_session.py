@@ -18,7 +18,7 @@ import numpy as np
 
 from onedemo.app.annotation.assignment import Ask, Assignment, Seat, to_repeat, to_share
 from onedemo.reward.segment_marks import Mark, picture_of_step, pictures_of_steps, steps_of_pictures
-from onedemo.storage.ratings import AlreadyAnswered, LastAnswer
+from onedemo.storage.rating_records import AlreadyAnswered, LastAnswer
 from onedemo.storage.store import Store
 from onedemo.types import Demo, Rater
 

@@ -54,8 +54,8 @@ def export(
         card: The data card, in Markdown.
         all_: Everything, into this new directory, for `onedemo import`.
     """
+    from onedemo.app.dataset.csv_writer import csv_blocks
     from onedemo.app.dataset.exporter import FILES, write_export, write_file
-    from onedemo.app.dataset.ratings_csv import csv_blocks
     from onedemo.core.directories import make_directory
     from onedemo.core.files import write_atomic
 

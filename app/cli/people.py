@@ -123,7 +123,7 @@ def audit(*, csv: Path | None = None, data_dir: DataDir = DATA) -> None:
     Args:
         csv: Write it there, as CSV.
     """
-    from onedemo.app.dataset.ratings_csv import csv_blocks
+    from onedemo.app.dataset.csv_writer import csv_blocks
     from onedemo.core.files import write_atomic
     from onedemo.storage.audit_log import AUDIT_COLUMNS
 

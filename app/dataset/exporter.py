@@ -7,11 +7,11 @@ from itertools import chain
 from pathlib import Path
 
 from onedemo.app.dataset.card import card
+from onedemo.app.dataset.csv_writer import csv_blocks
 from onedemo.app.dataset.parquet import write_pairs, write_segments
-from onedemo.app.dataset.ratings_csv import csv_blocks
 from onedemo.core.files import replacing, write_atomic
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
-from onedemo.storage.ratings import HISTORY_COLUMNS, RATING_COLUMNS, SKIP_COLUMNS
+from onedemo.storage.rating_records import HISTORY_COLUMNS, RATING_COLUMNS, SKIP_COLUMNS
 from onedemo.storage.store import Store
 
 FILES = (

@@ -238,11 +238,11 @@ def _check_run(run: Any, file: Path) -> None:
         check_run_name(run["id"])
         check_name(run["demo"])
         if not re.fullmatch(r"[0-9a-f]{64}", run["demo_sha256"], re.ASCII):
-            raise ValueError("demo_sha256 is none")
+            raise ValueError("demo_sha256 is not a SHA-256")
         if not 0 <= run["seed"] < 2**63 or isinstance(run["seed"], bool):
             raise ValueError("seed is out of range")
         if not re.fullmatch(r"[\w.+!-]{1,40}", run["version"], re.ASCII):
-            raise ValueError("version is none")
+            raise ValueError("version is not a version")
         if run.get("created_at") is not None:
             cell.time(run["created_at"])
         if not 1e-6 < float(run.get("step_seconds", 0.008)) < 10:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from onedemo.storage.ratings import MOST_REASON
+from onedemo.storage.rating_records import MOST_REASON
 from onedemo.storage.store import Store
 from onedemo.types import Rater
 

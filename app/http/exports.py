@@ -15,7 +15,7 @@ from typing import Any
 
 from aiohttp import web
 
-from onedemo.app.dataset import ratings_csv
+from onedemo.app.dataset import csv_writer
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import RATINGS
 from onedemo.app.dataset.exporter import FILES, csv_of, write_export, write_file
@@ -45,7 +45,7 @@ class Downloads:
     async def csv(self, request: web.Request) -> web.StreamResponse:
         """The ratings."""
         rows = self._store.ratings.stream(**read_filters(request.query))
-        return await self._stream(request, "ratings", ratings_csv.csv_blocks(rows))
+        return await self._stream(request, "ratings", csv_writer.csv_blocks(rows))
 
     async def comparisons(self, request: web.Request) -> web.StreamResponse:
         """The answers about pairs."""
@@ -96,7 +96,7 @@ class Downloads:
     ) -> web.StreamResponse:
         response = self._attachment(what, suffix, kind)
         with tempfile.TemporaryDirectory() as directory:
-            file = Path(directory) / ratings_csv.file_name(what, suffix)
+            file = Path(directory) / csv_writer.file_name(what, suffix)
             try:
                 await asyncio.to_thread(write, file)
             except OSError as error:
@@ -151,7 +151,7 @@ class Downloads:
         response.content_type = kind
         if kind.startswith("text/"):
             response.charset = "utf-8"
-        name = ratings_csv.file_name(what, suffix)
+        name = csv_writer.file_name(what, suffix)
         response.headers["Content-Disposition"] = f'attachment; filename="{name}"'
         return response
 

@@ -1,9 +1,8 @@
 """The public HTTP port: one table of what there is and who may have it.
 
-``onedemo.app.http.auth`` says who asks, ``onedemo.app.http.media`` and ``onedemo.app.http.exports`` hand
-out files, ``onedemo.app.http.viser_proxy`` carries
-the page's WebSocket to Viser. The page itself is Viser's single HTML file with our style sheet and
-key handling added.
+``auth`` and ``sessions`` say who asks, ``media`` and ``exports`` hand out files, ``uploads`` takes videos,
+``viser_proxy`` carries the page's WebSocket to Viser. The page itself is Viser's single HTML file with our
+style sheet and scripts added (``assets``). The connections below all this are ``onedemo.app.network``.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
 from onedemo.app.network.bind import Listening
-from onedemo.app.network.connections import Connections, Limits, raise_descriptors
+from onedemo.app.network.capacity import Limits, raise_descriptors
+from onedemo.app.network.connections import Connections
 from onedemo.app.network.rate_limit import (
     ACTIONS_WAITING,
     PRESSES_AT_ONCE,
@@ -104,7 +104,7 @@ class Front:
     """The public port, in a thread with an event loop of its own.
 
     Args:
-        page: The Viser page behind the door; its trainer is the run that is served.
+        page: The Viser page behind this port; its trainer is the run that is served.
         listening: Where to listen, and under which names.
     """
 

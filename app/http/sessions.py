@@ -24,11 +24,11 @@ from onedemo.types import Rater
 RATER = web.RequestKey("rater", Rater)
 SESSION = web.RequestKey("session", str)
 """The hash of the cookie's token."""
-_T = TypeVar("_T")
-_THREADS = 4
 PERSON = r"/r/{rater:\d{1,9}}"
 """Where everything of one person's page is."""
 
+_T = TypeVar("_T")
+_THREADS = 4
 _MOST_VALUES = 4
 """Cookies of one name that are looked at; a browser sends those of the longest path first."""
 _ENDED = {

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,9 +78,6 @@ class Uploads:
             ) from None
         finally:
             self._open -= 1
-            if path is not None:
-                with suppress(OSError):
-                    path.unlink()
         known = demo.name != fields["name"]
         said = f"This video is known already, as {demo.name}" if known else f"{demo.name} is a demo now"
         return web.Response(

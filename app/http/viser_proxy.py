@@ -71,7 +71,7 @@ class Proxy:
     """Carries the messages of all pages.
 
     Args:
-        page: The Viser page behind the door.
+        page: The Viser page behind the public port.
         store: Knows whose session still holds.
         most_pages: Open at once.
     """

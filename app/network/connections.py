@@ -1,10 +1,11 @@
-"""Connections of the front: who may hold how many, for how long, and how much may come over one.
+"""Connections of the front: in which order they get in, how long they last, how much may come over one.
 
 Whoever comes waits in a lobby, which costs a socket and nothing else, until a whole header has come. Then the
 connection is aiohttp's, and, until its request has shown a session, a stranger's. Lobby and strangers have
 fixed numbers of places; when those are taken, the oldest connection of the address that holds most of them
 ends. So a newcomer always gets in. One that shows a session counts as that person's from then on, whom
-strangers cannot crowd out. All places together are fewer than the file descriptors of the process.
+strangers cannot crowd out. How many places there are, fewer in all than the file descriptors of the process,
+is in ``onedemo.app.network.capacity``.
 """
 
 from __future__ import annotations
@@ -15,15 +16,14 @@ import logging
 import re
 import socket
 import ssl
-from collections.abc import Coroutine, Hashable, Iterator
+from collections.abc import Coroutine, Hashable
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Generic, TypeVar
 
 from aiohttp import web
 
 from onedemo.app.network.bind import network
-from onedemo.app.network.rate_limit import MOST_PAGES, MOST_PAGES_EACH, Bucket
+from onedemo.app.network.capacity import Crowd, Limits
+from onedemo.app.network.rate_limit import Bucket
 
 log = logging.getLogger("onedemo.page")
 
@@ -36,8 +36,8 @@ KEEP_ALIVE_S = 75.0
 STALLED_S = 30.0
 """How long what was sent may go untaken."""
 HANDSHAKE_S = 10.0
+NOT_UNDERSTOOD = "This is no request that can be understood."
 _LOOK_S = 1.0
-_WANTED_DESCRIPTORS = 16_384
 _WAITING = 1024
 """Connections that the system holds until they are accepted."""
 _ACCEPTED_AT_ONCE = 64
@@ -46,103 +46,6 @@ _LARGEST_HEADER = 1 << 15
 _NO_REQUEST = re.compile(rb"(?![A-Z]{1,20} \S+ HTTP/1\.[01]\r?\n)[^\n]*\n")
 """A first line that no header can follow."""
 _NONE_LEFT = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-
-Item = TypeVar("Item", bound=Hashable)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """How many connections there may be."""
-
-    strangers: int
-    """Without a session; as many more may wait in the lobby."""
-    strangers_each: int
-    """Of one address."""
-    members: int
-    """With a session."""
-    members_each: int
-    """Of one person."""
-    pages: int
-    """Open pages. Each has a connection of a member, and two more descriptors towards Viser."""
-
-    @classmethod
-    def of(cls, descriptors: int, *, addresses_known: bool = True) -> Limits:
-        """What a process with so many file descriptors can afford: a quarter is left for everything else.
-
-        Args:
-            descriptors: As ``raise_descriptors`` gives it.
-            addresses_known: Whether connections come from the people themselves, not from one proxy.
-        """
-        strangers = min(512, descriptors // 8)
-        return cls(
-            strangers=strangers,
-            strangers_each=min(256, strangers // 2) if addresses_known else strangers,
-            members=min(2048, descriptors // 4),
-            members_each=8 * MOST_PAGES_EACH,  # a browser has six, and the page's own
-            pages=min(MOST_PAGES, descriptors // 8),
-        )
-
-
-def raise_descriptors() -> int:
-    """Lets the process have as many file descriptors as it may (up to 16,384); returns how many."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit; select() there takes 512
-        return 512
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    unlimited = resource.RLIM_INFINITY
-    wanted = _WANTED_DESCRIPTORS if hard == unlimited else min(hard, _WANTED_DESCRIPTORS)
-    for most in (wanted, 10_240, 4096):  # some systems name a limit that they do not grant
-        if soft != unlimited and soft < most <= wanted:
-            with suppress(ValueError, OSError):
-                resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-                break
-    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return _WANTED_DESCRIPTORS if soft == unlimited else soft
-
-
-class Crowd(Generic[Item]):
-    """Items by whose they are: so many in all, so many of each. Whoever comes is let in; another leaves.
-
-    Args:
-        most: In all.
-        most_each: Of one.
-    """
-
-    def __init__(self, most: int, most_each: int) -> None:
-        self._most, self._most_each = most, most_each
-        self._of: dict[Hashable, dict[Item, None]] = {}
-        self._count = 0
-
-    def __iter__(self) -> Iterator[Item]:
-        for of in tuple(self._of.values()):
-            yield from tuple(of)
-
-    def enter(self, whose: Hashable, item: Item) -> Item | None:
-        """Lets an item in, as the newest; returns the one that has to leave for it, if any."""
-        self.leave(whose, item)
-        out = None
-        if len(self._of.get(whose, ())) >= self._most_each:
-            out = self._oldest(whose)
-        elif self._count >= self._most:
-            out = self._oldest(max(self._of, key=lambda one: len(self._of[one])))
-        self._of.setdefault(whose, {})[item] = None
-        self._count += 1
-        return out
-
-    def leave(self, whose: Hashable, item: Item) -> None:
-        """Takes an item out, if it is in."""
-        of = self._of.get(whose, {})
-        if item in of:
-            del of[item]
-            self._count -= 1
-            if not of:
-                del self._of[whose]
-
-    def _oldest(self, whose: Hashable) -> Item:
-        item = next(iter(self._of[whose]))
-        self.leave(whose, item)
-        return item
 
 
 class _Visitor:
@@ -258,7 +161,7 @@ class Connection(web.RequestHandler):
         if status >= 500:
             response = super().handle_error(request, status, exc, message)
         else:
-            response = web.Response(status=status, text="This is no request that can be understood.")
+            response = web.Response(status=status, text=NOT_UNDERSTOOD)
             response.force_close()
         response.headers["Server"] = "onedemo"  # else aiohttp tells its version
         return response

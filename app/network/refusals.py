@@ -1,4 +1,4 @@
-"""The one place that turns whatever somebody sends into a short answer: 4xx for what is wrong with it.
+"""The one place that turns what is wrong with a request into a short answer, 4xx.
 
 Nothing of a body is read before the right is checked, nothing is ever inflated, and what nobody read ends
 the connection.
@@ -18,7 +18,7 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 
 from onedemo.app.network.bind import Listening
-from onedemo.app.network.connections import Connection
+from onedemo.app.network.connections import NOT_UNDERSTOOD, Connection
 from onedemo.app.network.rate_limit import Buckets
 
 log = logging.getLogger("onedemo.page")
@@ -76,7 +76,7 @@ class Refusals:
 
     @web.middleware
     async def within(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Around the handlers: whoever gets here may be here."""
+        """Around the handlers: access has been checked by now."""
         person = self._person(request)
         if person is not None and isinstance(request.protocol, Connection):
             request.protocol.belongs_to(person)
@@ -142,10 +142,10 @@ def explain(error: Exception) -> web.HTTPException:
     if isinstance(error, TimeoutError):
         return web.HTTPServiceUnavailable(text="The server is very busy. Please try again in a minute.")
     too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-    if too_long or isinstance(error, (OverflowError, RecursionError, UnicodeError)):
-        return web.HTTPBadRequest(text="This is no request that can be understood.")
-    if isinstance(error, (HttpProcessingError, web.RequestPayloadError)):  # a body that is not as announced
-        return web.HTTPBadRequest(text="This is no request that can be understood.")
+    # The last two: a body that is not as announced.
+    hostile = (OverflowError, RecursionError, UnicodeError, HttpProcessingError, web.RequestPayloadError)
+    if too_long or isinstance(error, hostile):
+        return web.HTTPBadRequest(text=NOT_UNDERSTOOD)
     if isinstance(error, ConnectionError):  # whoever asked has gone
         return web.HTTPBadRequest(text="The connection ended.")
     log.error("a request could not be answered", exc_info=error)

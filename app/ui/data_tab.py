@@ -15,7 +15,7 @@ from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater,
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.templates import render
 from onedemo.app.ui.context import TabContext
-from onedemo.storage.ratings import SKIP_COLUMNS
+from onedemo.storage.rating_records import SKIP_COLUMNS
 from onedemo.types import Rater, Status
 
 log = logging.getLogger("onedemo.page")

@@ -12,7 +12,7 @@ import pytest
 from browser.test_page import DESKTOP, GUARD_MS, SMALL, opened, until
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import SKIPS
-from onedemo.storage.ratings import SKIP_COLUMNS
+from onedemo.storage.rating_records import SKIP_COLUMNS
 
 pytestmark = pytest.mark.seam
 

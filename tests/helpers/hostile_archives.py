@@ -259,7 +259,7 @@ HOSTILE = (
     Hostile("a run called ../../../home/x/.cargo", _sql("PRAGMA foreign_keys = OFF", *_RENAMED),
             "the database in .* is damaged: a name is 1 to 84 letters", stored),
     Hostile("a snapshot called ../x", _sql("UPDATE snapshots SET number = '../x'"),
-            "a number in its table snapshots is none", stored),
+            "its table snapshots holds text in the place of a number", stored),
     Hostile("rows that belong to nothing", _sql("DELETE FROM raters"),
             "rows of .* belong to nothing", stored),
     Hostile("a database with other bytes", _turned, "the database in .* (is damaged|was changed)", stored),

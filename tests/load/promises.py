@@ -1,6 +1,6 @@
 """A table of what the long checks found.
 
-``python tests/load/promises.py OUT.md kill.json door.json attack.json soak.json``.
+``python tests/load/promises.py OUT.md kill.json fuzz.json ...``: see the Makefile for all of them.
 
 Files that are missing are left out. Each check writes its figures with ``--json``.
 """

@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager, suppress
 import pytest
 
 from helpers.paths import ROOT
+from helpers.small_disk import small_disk
 from helpers.small_world import falling_demo, small_config
 from load.serving import FEW_STATES, serving
 from onedemo.errors import UserError, in_words
@@ -76,15 +77,9 @@ def no_right(file):
 
 
 @pytest.fixture
-def small_disk(tmp_path):
-    """A file system of its own, of 24 MB, for the data."""
-    place = tmp_path / "data"
-    place.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", place], capture_output=True)
-    if mounted.returncode:
-        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
-    yield
-    subprocess.run(["umount", "-l", place], check=True)
+def small_data_disk(tmp_path):
+    with small_disk(tmp_path / "data", "24m"):
+        yield
 
 
 @pytest.mark.parametrize(
@@ -98,7 +93,7 @@ def small_disk(tmp_path):
 )
 def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(tmp_path, request, fault, words):
     if fault is full:
-        request.getfixturevalue("small_disk")
+        request.getfixturevalue("small_data_disk")
     if fault is no_right:
         if os.geteuid() != 0:
             pytest.skip("only root can become somebody without the right and come back")
@@ -204,7 +199,7 @@ def test_nothing_goes_by_the_clock_on_the_wall():
 
     The time of day is written down, as text, and ends links; nothing else is done with it.
     """
-    stamps = {"database.py", "accounts.py", "card.py", "ratings_csv.py", "backup.py", "machine.py"}
+    stamps = {"database.py", "accounts.py", "card.py", "csv_writer.py", "backup.py", "machine.py"}
     files = [*ROOT.glob("app/**/*.py"), *ROOT.glob("trainer/**/*.py")]
     assert stamps <= {path.name for path in files}
     for path in files:

@@ -14,14 +14,14 @@ import pytest
 import viser
 
 from helpers.beside_playwright import run
-from onedemo.app.dataset import ratings_csv
+from onedemo.app.dataset import csv_writer
 from onedemo.app.http.auth import AccessControl
 from onedemo.app.http.server import Front, check_port
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.network.bind import Listening
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.store import Store
 
 pytestmark = pytest.mark.seam
@@ -228,10 +228,10 @@ def test_export_is_for_researchers(site):
 
 def test_csv_cells_that_look_like_formulas_are_defused():
     for text in ("=1", "+1", "-1", "@x", "\tx", "\rx"):
-        assert ratings_csv.defuse(text) == "'" + text
-    assert ratings_csv.defuse(-1.5) == -1.5
-    assert ratings_csv.defuse("a=b") == "a=b"
-    blocks = list(ratings_csv.csv_blocks([(1,) * 14] * 5, rows_per_block=2))
+        assert csv_writer.defuse(text) == "'" + text
+    assert csv_writer.defuse(-1.5) == -1.5
+    assert csv_writer.defuse("a=b") == "a=b"
+    blocks = list(csv_writer.csv_blocks([(1,) * 14] * 5, rows_per_block=2))
     assert b"".join(blocks).count(b"\r\n") == 6
 
 

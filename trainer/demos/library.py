@@ -39,7 +39,8 @@ from onedemo.errors import UserError
 from onedemo.types import Demo
 
 BUILT_IN = Path(static.__file__).parent / "demos"
-_VIDEO = "video.webm"
+_VIDEO, _ABOUT = "video.webm", "demo.json"
+"""The two files of a demo of the library."""
 
 _log = logging.getLogger(__name__)
 
@@ -107,7 +108,7 @@ def import_video(
     except OSError as error:
         raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
     with place as workshop:
-        video = workshop / "video.webm"
+        video = workshop / _VIDEO
         check, pictures = StoredCheck(), hashlib.sha256(f"{fps:g}".encode())
         with closing(decode(path, options, limits)) as frames:
             count = write_webm(video, _noting(frames, check, pictures), fps=fps)
@@ -116,7 +117,7 @@ def import_video(
             for frame in reader.frames():
                 check.stored(frame)
         about = _describe(
-            workshop / "demo.json",
+            workshop / _ABOUT,
             video,
             name=name,
             sha256=pictures.hexdigest(),
@@ -152,7 +153,7 @@ def rename_demo(demo: Demo, name: str, demos_dir: Path) -> Demo:
         UserError: If it came with the program, or the name is not allowed or taken.
     """
     check_new_name(check_name(name))
-    path = _own_directory(demo, demos_dir) / "demo.json"
+    path = _own_directory(demo, demos_dir) / _ABOUT
     with _names(demos_dir):
         _check_free(name, list_demos(demos_dir))
         about = json.loads(path.read_bytes()) | {"name": name}
@@ -221,7 +222,7 @@ def list_demos(demos_dir: Path) -> list[Demo]:
 
 def is_whole(demo: Demo) -> bool:
     """Whether the stored video is, to the byte, what was stored."""
-    about = demo.path.with_name("demo.json") if demo.path.name == _VIDEO else demo.path.with_suffix(".json")
+    about = demo.path.with_name(_ABOUT) if demo.path.name == _VIDEO else demo.path.with_suffix(".json")
     try:
         known = json.loads(about.read_bytes())
         return _sha256(demo.path) == known.get("video_sha256", known["sha256"])
@@ -355,9 +356,9 @@ def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
 
 def _load_all(demos_dir: Path) -> Iterator[tuple[Demo, dict[str, Any]]]:
     places = [(path, path.with_suffix(".webm")) for path in sorted(BUILT_IN.glob("*.json"))]
-    for path in sorted(demos_dir.glob("*/demo.json")):
+    for path in sorted(demos_dir.glob(f"*/{_ABOUT}")):
         if not path.parent.name.startswith("."):
-            places.append((path, path.parent / "video.webm"))
+            places.append((path, path.parent / _VIDEO))
     for path, video in places:
         try:
             about = json.loads(path.read_bytes())

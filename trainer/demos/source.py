@@ -26,6 +26,7 @@ import numpy as np
 from av.video.reformatter import Interpolation
 
 from onedemo.demos.containers import CONVERT, missing_bytes
+from onedemo.demos.frame_geometry import orientation, pixel_aspect, square_pixels, turned
 from onedemo.errors import UserError
 
 FORMATS = (
@@ -116,13 +117,13 @@ class Source:
         self.fps = float(rate) if 0.1 <= rate <= 1000 else 30.0
         self.seconds = self._length()
         self.whole = max(self._stream.frames, round(self.seconds * self.fps))
-        self._aspect = _sensible(self._stream.sample_aspect_ratio)
+        self._aspect = pixel_aspect(self._stream.sample_aspect_ratio)
         self._turn = (1, 0, 0, 1)
         self._origin = self._last_end = 0.0
         self._first, self._all = self._open_first()
         self._origin = _stamp(self._first) or 0.0
-        width, height = _square(self._first.width, self._first.height, self._aspect)
-        self._turn = _orientation(self._first)
+        width, height = square_pixels(self._first.width, self._first.height, self._aspect)
+        self._turn = orientation(self._first)
         self.width, self.height = (width, height) if self._turn[0] else (height, width)
 
     def frames(self, start: float = 0.0) -> Iterator[Shown]:
@@ -306,10 +307,10 @@ class Source:
             format="rgb24", threads=1,
             interpolation=Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.BITEXACT,
         )  # fmt: skip
-        size = _square(self._first.width, self._first.height, self._aspect)
+        size = square_pixels(self._first.width, self._first.height, self._aspect)
         if size != picture.shape[1::-1]:  # also one whose size changes on the way
             picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        return _turned(picture, self._turn)
+        return turned(picture, self._turn)
 
     def _open_webp(self, file: BinaryIO, head: bytes) -> None:
         self.width = int.from_bytes(head[24:27], "little") + 1
@@ -378,31 +379,3 @@ def _ready(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
 def _rest(graph: av.filter.Graph) -> Iterator[av.VideoFrame]:
     graph.vpush(None)
     yield from _ready(graph)
-
-
-def _sensible(aspect: Fraction | None) -> float:
-    """Width of a pixel by its height."""
-    return float(aspect) if aspect and 0.1 <= aspect <= 10 else 1.0
-
-
-def _square(width: int, height: int, aspect: float) -> tuple[int, int]:
-    """The size once pixels are square: the height stays."""
-    return max(1, round(width * aspect)), height
-
-
-def _orientation(frame: av.VideoFrame) -> tuple[int, int, int, int]:
-    """The display matrix as (a, b, c, d): x' = a x + c y, y' = b x + d y, each -1, 0 or 1."""
-    matrix = frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
-        return 1, 0, 0, 1
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].astype(float)
-    if abs(a) + abs(d) >= abs(b) + abs(c):
-        return (-1 if a < 0 else 1), 0, 0, (-1 if d < 0 else 1)
-    return 0, (-1 if b < 0 else 1), (-1 if c < 0 else 1), 0
-
-
-def _turned(picture: np.ndarray, turn: tuple[int, int, int, int]) -> np.ndarray:
-    a, b, c, d = turn
-    if not a:
-        picture = picture.swapaxes(0, 1)
-    return picture[:: b or d, :: a or c]

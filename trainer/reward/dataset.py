@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.storage.ratings import RatedSegment, Rating
+from onedemo.storage.rating_records import RatedSegment, Rating
 from onedemo.storage.store import Store
 from onedemo.types import Segment
 

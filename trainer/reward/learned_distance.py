@@ -34,7 +34,7 @@ from onedemo.reward.latent_track import track_of
 from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View
 from onedemo.reward.segment_marks import marked_steps
 from onedemo.sim import kinematics
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 
 _UPDATES = 300
 _RATE = 0.03

@@ -23,7 +23,7 @@ import torch
 from onedemo.core.files import archive_fault, write_atomic
 from onedemo.errors import UserError
 from onedemo.reward.settings import KINDS, PredictorConfig
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.vision.pose_estimator import Track
 
 CLASSES = 5

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from onedemo.demos.frame_clock import frame_of_step
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.types import Clip, Demo, Segment
 
 Mark = tuple[int, int]

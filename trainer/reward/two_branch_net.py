@@ -22,7 +22,7 @@ from torch.nn import functional
 from onedemo.errors import UserError
 from onedemo.reward.model import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
 from onedemo.reward.segment_marks import split_marks
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 
 STANDARD_DIMS = 15
 _JUDGED_CLIPS = 2000

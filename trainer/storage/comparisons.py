@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from onedemo.storage.database import Database, now
-from onedemo.storage.ratings import LOOKED_BACK, AlreadyAnswered
+from onedemo.storage.rating_records import LOOKED_BACK, AlreadyAnswered
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
 from onedemo.types import Segment
 

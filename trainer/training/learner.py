@@ -26,7 +26,7 @@ from onedemo.rl.random_states import wild_rollouts
 from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.rl.trpo import Trpo
 from onedemo.sim import kinematics, vector_env
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.types import Rollouts, Segment
 from onedemo.vision.pose_estimator import Track
 

@@ -8,17 +8,11 @@ import numpy as np
 import pytest
 
 from helpers.hostile_archives import small_study
-from onedemo.app.admin.doctor import _database, _disk
+from helpers.segments import noise
+from onedemo.app.admin.doctor import _database, _privacy
 from onedemo.storage.clips import NewClip
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
-from onedemo.types import Segment
-
-
-def segment(rng):
-    widths = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
-    arrays = {name: rng.normal(size=(38, width)) for name, width in widths.items()}
-    return Segment(**arrays | {"actions": arrays["actions"].astype(np.float32)})
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +20,11 @@ def made(tmp_path_factory):
     """A study of fifty clips, all in the one file; and where the motion of the clips lies in it."""
     directory = tmp_path_factory.mktemp("made") / "data"
     rng = np.random.default_rng(0)
-    small_study(directory, segment(rng))
+    small_study(directory, noise(rng, 38))
     with closing(Store(directory)) as store:
         ann = store.accounts.ensure("Ann", "annotator").id
         for _ in range(49):
-            new = NewClip(demo_step=0, segment=segment(rng), stage="online", iteration=1)
+            new = NewClip(demo_step=0, segment=noise(rng, 38), stage="online", iteration=1)
             (clip,) = store.clips.add("r", [new])
             store.ratings.rate(clip.id, ann, 3, 900)
         places = [row.obs.tobytes()[:64] for _, row in store.clips.answered()]
@@ -72,7 +66,7 @@ def test_256_random_bytes_in_the_motion_are_found_by_the_full_check(made, tmp_pa
 @pytest.mark.parametrize(
     ("statement", "what"),
     [
-        ("UPDATE runs SET created_at = 'x'", "1 times in runs are none"),
+        ("UPDATE runs SET created_at = 'x'", "1 times in runs are not times"),
         ("UPDATE runs SET config = '\x01 ='", "the settings of run r are damaged"),
         ("UPDATE snapshots SET stats = '{'", "what snapshots 1 of run r says is damaged"),
         ("UPDATE tallies SET ratings = 7 WHERE value = 3", "counts of ratings are not those of the events"),
@@ -99,7 +93,7 @@ def test_a_database_that_another_program_changed_is_named_and_not_run(made, tmp_
 
 def test_an_open_data_directory_is_named(made, tmp_path):
     shutil.copytree(made[0], tmp_path / "data")
-    assert all(finding.ok for finding in _disk(tmp_path / "data"))
+    assert all(finding.ok for finding in _privacy(tmp_path / "data"))
     (tmp_path / "data").chmod(0o755)
-    wrong = [finding.said for finding in _disk(tmp_path / "data") if not finding.ok]
+    wrong = [finding.said for finding in _privacy(tmp_path / "data") if not finding.ok]
     assert len(wrong) == 1 and "chmod -R go-rwx" in wrong[0]

@@ -14,7 +14,7 @@ from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment, t
 from onedemo.app.annotation.rating_session import AnsweredElsewhere, RatingSession
 from onedemo.config import RatingsConfig, RunConfig
 from onedemo.storage.clips import NewClip
-from onedemo.storage.ratings import Answered
+from onedemo.storage.rating_records import Answered
 from onedemo.storage.store import Store
 from onedemo.training.rating_queue import RatingQueue
 from onedemo.types import Demo, Segment

@@ -17,7 +17,7 @@ from load.serving import FEW_STATES
 from onedemo.app.cli.main import _app, main
 from onedemo.config import METHODS, RunConfig, describe, to_toml
 from onedemo.storage.database import FILE_NAME
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.schema import STEPS as SCHEMA
 from onedemo.storage.store import Store
 

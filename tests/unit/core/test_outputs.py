@@ -1,9 +1,8 @@
 """Where results are to be written is tried before the work, by every command that writes any."""
 
-import subprocess
-
 import pytest
 
+from helpers.small_disk import small_disk
 from onedemo.app.cli.main import main
 from onedemo.core.outputs import check_data_dir, check_outputs, check_prefix
 from onedemo.errors import UserError
@@ -55,15 +54,7 @@ def test_what_can_be_written_leaves_nothing_behind(here):
 
 
 def test_a_disk_without_a_block_left(here):
-    place = here / "small"
-    place.mkdir()
-    if subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", place], capture_output=True
-    ).returncode:
-        pytest.skip("a small file system cannot be mounted here")
-    try:
+    with small_disk(here / "small", "8k") as place:
         (place / "ballast").write_bytes(bytes(8192))
         with pytest.raises(UserError, match="no space left"):
             check_outputs(place / "result")
-    finally:
-        subprocess.run(["umount", "-l", place], check=True)

@@ -14,7 +14,7 @@ from onedemo.app.dataset.card import card
 from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SEGMENTS, SKIPS, as_table
 from onedemo.config import load_config
 from onedemo.reward.dataset import TrainingSet
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated

@@ -5,7 +5,6 @@ import io
 import json
 import re
 import shutil
-import subprocess
 import zipfile
 from contextlib import closing
 
@@ -17,6 +16,8 @@ from aiohttp import web
 from aiohttp.test_utils import TestClient, TestServer
 
 from helpers import beside_playwright
+from helpers.segments import noise
+from helpers.small_disk import small_disk
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.exporter import FILES
@@ -26,7 +27,6 @@ from onedemo.config import load_config, to_toml
 from onedemo.storage.clips import NewClip
 from onedemo.storage.comparisons import NewPair
 from onedemo.storage.store import Store
-from onedemo.types import Segment
 
 EVENTS = (
     "SELECT e.*, p.name, b.name FROM events e JOIN raters p ON p.id = e.rater_id"
@@ -34,12 +34,6 @@ EVENTS = (
 )
 ANSWERS = "SELECT c.*, p.name FROM comparisons c JOIN raters p ON p.id = c.rater_id ORDER BY c.id"
 BY_ID = ("rater_id", "by_id")
-
-
-def segment(rng):
-    widths = {"obs": 11, "actions": 3, "qpos": 6, "qvel": 6}
-    arrays = {name: rng.normal(size=(5, width)) for name, width in widths.items()}
-    return Segment(**arrays | {"actions": arrays["actions"].astype(np.float32)})
 
 
 @pytest.fixture(scope="module")
@@ -53,14 +47,16 @@ def study(tmp_path_factory):
             store.runs.add(run=run, demo="hop", demo_sha256="ab" * 32, seed=1, config=config, version="0.3.0",
                            step_seconds=0.01, created_at="2026-01-02T03:04:05.678Z")  # fmt: skip
         new = lambda: NewClip(  # noqa: E731
-            demo_step=int(rng.integers(100)), segment=segment(rng), stage="online", iteration=3, snapshot=2,
+            demo_step=int(rng.integers(100)), segment=noise(rng, 5), stage="online", iteration=3, snapshot=2,
             predicted=float(rng.uniform(1, 5)), choice="high", score=0.1,
         )  # fmt: skip
         clips = [clip.id for run in ("first", "second") for clip in store.clips.add(run, [new()] * 6)]
         pairs = []
         for run in ("first", "second"):
-            news = [NewPair(demo_step=k, left=segment(rng), right=segment(rng), stage="pretrain", iteration=0)
-                    for k in range(4)]  # fmt: skip
+            news = [
+                NewPair(demo_step=k, left=noise(rng, 5), right=noise(rng, 5), stage="pretrain", iteration=0)
+                for k in range(4)
+            ]
             pairs += [pair.id for pair in store.comparisons.add_pairs(run, news)]
         ann = store.accounts.ensure("Ann", "annotator").id
         bob = store.accounts.ensure("007", "researcher").id
@@ -277,7 +273,7 @@ EDITED = {
     "Parquet of 72 MB in 20 KB": (bomb, "would unpack to .* numbers: no export of onedemo does"),
     "HTML as a demo": (about({"demo": "<img src=x onerror=alert(1)>"}), "a name is 1 to 64 letters"),
     "a run with a path": (about({"id": "../../../home/x/.cargo"}), "a name is 1 to 84 letters"),
-    "HTML as a version": (about({"version": "<b>1"}), "version is none"),
+    "HTML as a version": (about({"version": "<b>1"}), "version is not a version"),
     "a seed of 2^70": (about({"seed": 2**70}), "seed is out of range"),
     "settings that are none": (about({"config": "a = ="}), "does not say what its runs are"),
     "another robot": (about({"config": "env = 'dog'"}), "unknown environment 'dog'"),
@@ -324,7 +320,7 @@ def test_nothing_in_a_name_is_more_than_text_in_the_card(tmp_path):
     with closing(Store(tmp_path)) as store:
         store.runs.add(run="r", demo="<img src=x>", demo_sha256="<b>", seed=0, config="", version="[a](b)")
         (clip,) = store.clips.add(
-            "r", [NewClip(demo_step=0, segment=segment(rng), stage="online", iteration=0)]
+            "r", [NewClip(demo_step=0, segment=noise(rng, 5), stage="online", iteration=0)]
         )
         rater = store.accounts.ensure("<script>|`x`", "annotator")
         store.ratings.rate(clip.id, rater.id, 3, 900)
@@ -333,22 +329,12 @@ def test_nothing_in_a_name_is_more_than_text_in_the_card(tmp_path):
     assert "&lt;script&gt;\\|\\`x\\`" in text
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    place = tmp_path / "small"
-    place.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "tmpfs", place], capture_output=True)
-    if mounted.returncode:
-        pytest.skip(f"a small file system cannot be mounted here: {mounted.stderr.decode().strip()}")
-    yield place
-    subprocess.run(["umount", "-l", place], check=True)
-
-
 @pytest.mark.parametrize("option", ["--all", "--segments", "--pairs", "--card"])
-def test_a_full_disk_is_a_sentence_and_leaves_no_half_file(study, small_disk, option, capsys):
-    arguments = ["export", "--data-dir", str(study[0]), option, str(small_disk / "out")]
-    assert main(arguments) == 2
+def test_a_full_disk_is_a_sentence_and_leaves_no_half_file(study, tmp_path, option, capsys):
+    with small_disk(tmp_path / "small", "4k") as place:
+        arguments = ["export", "--data-dir", str(study[0]), option, str(place / "out")]
+        assert main(arguments) == 2
+        left = [path.name for path in place.rglob("*") if path.is_file()]
     said = capsys.readouterr().err
     assert "The disk is full: free some space" in said and said.count("\n") == 1, said
-    left = [path.name for path in small_disk.rglob("*") if path.is_file()]
     assert set(left) <= {"history.csv"}  # whole ones of a whole export

@@ -14,7 +14,8 @@ from aiohttp import web
 
 from onedemo.app.network import connections, refusals
 from onedemo.app.network.bind import Listening
-from onedemo.app.network.connections import Connections, Crowd, Limits
+from onedemo.app.network.capacity import Crowd, Limits, raise_descriptors
+from onedemo.app.network.connections import Connections
 from onedemo.app.network.rate_limit import Bucket, Buckets
 from onedemo.app.network.refusals import Refusals, read_body, read_json
 
@@ -260,7 +261,7 @@ def test_as_many_descriptors_as_allowed_are_taken():
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
         resource.setrlimit(resource.RLIMIT_NOFILE, (500, before[1]))
-        taken = connections.raise_descriptors()
+        taken = raise_descriptors()
         assert taken == resource.getrlimit(resource.RLIMIT_NOFILE)[0] > 500
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)

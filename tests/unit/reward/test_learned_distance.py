@@ -11,7 +11,7 @@ from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track
 

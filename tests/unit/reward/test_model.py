@@ -4,7 +4,7 @@ import torch
 
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, visual_inputs
 from onedemo.reward.two_branch_net import SimilarityNet, class_weights, standard_inputs
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.types import Segment
 
 FRAMES = 60

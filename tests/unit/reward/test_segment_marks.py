@@ -17,7 +17,7 @@ from onedemo.reward.segment_marks import (
     steps_of_pictures,
 )
 from onedemo.storage.clips import NewClip
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.storage.store import Store
 from onedemo.types import Demo, Segment
 

@@ -11,7 +11,7 @@ from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.sim import kinematics
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated

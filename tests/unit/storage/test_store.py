@@ -9,7 +9,7 @@ import pytest
 from onedemo.errors import UserError
 from onedemo.storage.clips import NewClip
 from onedemo.storage.database import FILE_NAME
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.schema import STEPS
 from onedemo.storage.store import Store
 from onedemo.types import Segment

@@ -7,7 +7,7 @@ from onedemo.errors import UserError
 from onedemo.evaluation.episodes import summarise
 from onedemo.reward.learned_distance import MetricSnapshot
 from onedemo.rl.rollouts import evaluate
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.training.learner import Learner
 
 

@@ -74,19 +74,19 @@ def method_job(
     return Job(kind="method", label=label, settings=settings | whole_config(settings), seed=seed)
 
 
+_ONCE_CONSTANT = {"practice": {"random_lanes": 64, "bank_tries": 8000}}
+"""Settings that are newer than reported runs, with the values of before: at these, the job is the same."""
+
+
 def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
     """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
     config = asdict(run_config({"ratings": 350, "set": {}, **settings}, 0))
     del config["storage"]  # what a run leaves on the disk changes no result
-    for section, added in _ADDED.items():
-        for name, default in added.items():
-            if config[section][name] == default:
+    for section, constants in _ONCE_CONSTANT.items():
+        for name, value in constants.items():
+            if config[section][name] == value:
                 del config[section][name]
     return {"config": hashlib.sha256(to_toml(config).encode()).hexdigest()[:10]}
-
-
-_ADDED = {"practice": {"random_lanes": 64, "bank_tries": 8000}}
-"""Settings that were constants when runs were reported: those runs, which had these values, stay theirs."""
 
 
 def run(

@@ -25,7 +25,7 @@ from onedemo.experiments.jobs.method import prepare
 from onedemo.experiments.jobs.predictor_exam import Exam
 from onedemo.experiments.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
 from onedemo.reward.model import CLASSES, Snapshot
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.training.learner import Learner
 from onedemo.types import Demo
 from onedemo.vision import pose_estimator

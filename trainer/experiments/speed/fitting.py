@@ -9,7 +9,7 @@ import numpy as np
 from onedemo.config import load_config
 from onedemo.experiments.speed.figures import Growth, Result, single
 from onedemo.experiments.speed.training import learner_and_snapshot, made_up_ratings, one_thread
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.training.learner import Learner
 
 _DISTINCT = 350

@@ -18,7 +18,7 @@ from onedemo.core.cpu import cores
 from onedemo.experiments.speed.figures import Result, by_turns, ratio, single
 from onedemo.experiments.speed.physics import Bare, full_states
 from onedemo.reward.model import Snapshot
-from onedemo.storage.ratings import RatedSegment
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.training.learner import Learner
 from onedemo.types import Rollouts
 

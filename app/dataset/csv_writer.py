@@ -1,4 +1,4 @@
-"""Ratings as CSV, in pieces, safe to open in a spreadsheet."""
+"""Rows as CSV, in blocks, safe to open in a spreadsheet; ``csv_reader`` reads them back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
 
-from onedemo.storage.ratings import RATING_COLUMNS
+from onedemo.storage.rating_records import RATING_COLUMNS
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 
