@@ -11,7 +11,7 @@ import pytest
 
 from helpers.small_world import falling_demo, small_config
 from onedemo.app.cli.main import main
-from onedemo.core.files import jpeg_fault
+from onedemo.core.files import jpeg_fault, replacing
 from onedemo.demos.library import find_demo
 from onedemo.render.renderer import Order, RenderThread
 from onedemo.storage.clips import NewClip
@@ -163,6 +163,18 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         assert {path for path, _, _ in pictures_of(files)} == awaited(store, files)
         assert main(["tidy", "--data-dir", str(tmp_path)]) == 0
         assert "0.0 MB freed" in capsys.readouterr().out
+
+
+def test_what_is_being_written_is_neither_counted_nor_deleted(tmp_path):
+    with closing(Store(tmp_path)) as store:
+        files = RunDirectory(tmp_path, "r")
+        film, clip = files.path / "rollouts/000001.webm", files.clip(1)
+        with replacing(film, ".webm", sync=False) as half, replacing(clip, ".jpg", sync=False) as other:
+            half.write_bytes(b"half")
+            other.write_bytes(b"half")
+            assert pictures_of(files) == [] and tidy(store, files, 0) == 0
+        assert sorted(path for path, _, _ in pictures_of(files)) == [clip, film]
+        assert tidy(store, files, 0) == 8 and not film.exists()
 
 
 @pytest.mark.seam
