@@ -138,6 +138,57 @@ def test_a_page_comes_back_after_a_restart_and_keeps_the_press_and_the_tab(chrom
         assert other.locator(PILL).count() == 0
 
 
+def test_a_proxy_that_says_503_neither_drops_a_press_nor_is_shown_in_place_of_the_page(chromium, site, relay):
+    asked = []
+
+    def refuse(route):
+        asked.append(route.request.url)
+        route.fulfill(status=503, content_type="text/html", body="<h1>Service Unavailable</h1>")
+
+    with opened(chromium, relay.url(site.links["annotator"]), scripts=[QUICK]) as page:
+        clip = shown_clip(page)
+        page.evaluate("() => { window.same = true }")
+        page.route("**/*", refuse)
+        relay.break_off()
+        page.wait_for_selector(f"{PILL} >> text=Connection lost. Trying again; nothing is lost.")
+        page.keyboard.press("4")
+        page.wait_for_selector(".od-problem.od-late >> text=Not saved yet")
+        # Asked often enough to have loaded the page anew, had that been an answer.
+        until(lambda: page.wait_for_timeout(50) or sum(url.endswith("/session") for url in asked) > 8)
+        assert any(url.endswith("/press") for url in asked)
+        assert page.evaluate("() => window.same") and site.events() == []
+        page.unroute_all()
+        relay.cut = False
+        until(lambda: page.wait_for_timeout(50) or site.events(), 60)
+        page.wait_for_selector(f'.od-clip [data-clip]:not([data-clip="{clip}"])', timeout=30_000)
+        assert page.locator(f".od-problem, {PILL}").count() == 0
+        assert site.events() == [("rate", clip, 4, "bo")]
+
+
+def test_a_change_of_a_run_that_takes_long_is_not_cut_off(chromium, site, monkeypatch):
+    begun, go_on, pause = threading.Event(), threading.Event(), site.trainer.pause
+
+    def take_long():
+        begun.set()
+        assert go_on.wait(60)
+        pause()
+
+    monkeypatch.setattr(site.trainer, "pause", take_long)
+    try:
+        with opened(chromium, site.links["researcher"], scripts=[QUICK]) as page:
+            page.click(".od-tabs >> text=Runs")
+            page.click('[data-do="pause run"]')
+            until(lambda: page.wait_for_timeout(50) or begun.is_set())
+            page.evaluate("() => new Promise((go) => setTimeout(go, 2 * lineSettings.answerMs))")
+            button = page.locator('[data-do="pause run"]')
+            assert button.inner_text() == "Pause" and button.is_disabled()
+            go_on.set()
+            page.wait_for_selector('[data-do="resume run"]', timeout=20_000)
+            assert site.trainer.calls == ["pause"]
+    finally:
+        go_on.set()
+
+
 @pytest.mark.skipif(not LONG, reason="as long as the line of a person was cut: ONEDEMO_LONG=1")
 def test_a_page_comes_back_after_its_line_was_cut_for_40_s(chromium, site, relay):
     with opened(chromium, relay.url(site.links["annotator"])) as page:

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.hostile_archives import small_study
 from helpers.segments import noise
-from onedemo.app.admin.doctor import _database, _privacy
+from onedemo.app.admin.doctor import _database, _files, _privacy
 from onedemo.storage.clips import NewClip
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
@@ -97,3 +97,15 @@ def test_an_open_data_directory_is_named(made, tmp_path):
     (tmp_path / "data").chmod(0o755)
     wrong = [finding.said for finding in _privacy(tmp_path / "data") if not finding.ok]
     assert len(wrong) == 1 and "chmod -R go-rwx" in wrong[0]
+
+
+def test_a_lost_picture_is_named_although_somebody_was_left_out(tmp_path):
+    data_dir, motion = tmp_path / "data", noise(np.random.default_rng(0), 10)
+    small_study(data_dir, motion)
+    with closing(Store(data_dir)) as store:
+        new = NewClip(demo_step=0, segment=motion, stage="online", iteration=1)
+        store.clips.set_state([clip.id for clip in store.clips.add("r", [new])], "ready")
+        ann = store.accounts.ensure("Ann", "annotator").id
+        store.ratings.leave_out("r", ann, by=ann)  # an event of no clip
+    lost = [finding.said for finding in _files(data_dir) if "the picture of a clip" in finding.said]
+    assert len(lost) == 1 and "lacks" in lost[0] and "000002.jpg" in lost[0]

@@ -64,6 +64,23 @@ def test_a_good_one_is_there_afterwards_for_its_owner_alone(good, tmp_path):
         assert not stat.S_IMODE(path.stat().st_mode) & 0o077, path
 
 
+def test_hidden_files_of_the_user_stay(good, tmp_path):
+    """Beside what is made, of nearly its name, and nobody has them open."""
+    for name in (".env.local", ".env.d/key", ".a.onedemo-half-of-another/x"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    for name in ("env", "[ab]", "*"):
+        restore(good, tmp_path / name)
+        shutil.rmtree(tmp_path / name)
+    small_study(tmp_path / "data", SEGMENT)
+    for name in ("env", "[ab]", "*"):
+        back_up(tmp_path / "data", tmp_path / name)
+        (tmp_path / name).unlink()
+    shutil.rmtree(tmp_path / "data")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_a_backup_holds_what_onedemo_wrote_and_says_what_it_left_out(tmp_path):
     data_dir = tmp_path / "data"
     small_study(data_dir, SEGMENT)

@@ -35,3 +35,9 @@ def test_a_line_is_written_so_often_and_then_once_a_minute():
     assert "failed -8" not in written.getvalue()
     log.error("x" * 10 * LONGEST)
     assert len(written.getvalue().splitlines()[-1]) < 2 * LONGEST
+
+
+def test_a_record_that_is_wrongly_formatted_is_left_to_the_handler():
+    record = logging.LogRecord("x", logging.ERROR, __file__, 1, "%d of %d", ("one",), None)
+    assert LogLimit().filter(record)
+    assert record.msg == "%d of %d"

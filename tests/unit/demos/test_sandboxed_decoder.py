@@ -219,6 +219,14 @@ def test_a_child_that_complains_without_end_is_not_waited_for(tmp_path, monkeypa
     assert time.monotonic() - start < 20
 
 
+def test_what_a_child_says_last_is_one_short_printable_line(tmp_path, monkeypatch, caplog):
+    run_child_after(monkeypatch, "sys.stderr.write(chr(27) + '[2J' + 'y' * 5000); sys.exit(3)")
+    with pytest.raises(UserError, match=r"ended with: .*yyy") as told:
+        list(decode(make_video(tmp_path / "a.avi", count=12), Options()))
+    for said in (str(told.value), caplog.messages[-1]):
+        assert said.isprintable() and 200 < said.count("y") < 350
+
+
 def test_the_place_of_shared_libraries_is_passed_on(tmp_path, monkeypatch):
     monkeypatch.setenv("LD_LIBRARY_PATH", "/opt/python/lib")
     run_child_after(monkeypatch, "import os; raise SystemExit(os.environ['LD_LIBRARY_PATH'])")

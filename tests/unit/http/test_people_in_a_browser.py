@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import re
 import sqlite3
+import time
 from contextlib import asynccontextmanager, closing
+from datetime import timedelta
 from types import SimpleNamespace
 
 import aiohttp
@@ -184,6 +186,78 @@ def test_signing_out_ends_the_session_here_and_in_the_browser(store):
     assert [line[1:3] for line in store.audit.lines()] == [
         ("ann", "signed in"), ("bob", "signed in"), ("bob", "signed out"),
     ]  # fmt: skip
+
+
+def test_signing_out_ends_every_session_that_the_browser_has_of_that_person(store):
+    """An older cookie, for all paths, comes beside that of now."""
+
+    async def go():
+        async with front(store) as door, browser(door) as one, browser(door) as another:
+            name = f"onedemo-{door.port}-1"
+            tokens = []
+            for each in (one, another):
+                await each.get(link_of(store, door.url, "ann"))
+                tokens.append(each.sends("/r/1/")[name].value)
+            async with aiohttp.ClientSession(cookie_jar=aiohttp.DummyCookieJar()) as session:
+                bare = Browser(session, door.url)
+                both = "; ".join(f"{name}={token}" for token in tokens)
+                assert (await bare.post("/r/1/signout", Cookie=both)).status == 303
+                for token in tokens:
+                    assert (await bare.get("/r/1/session", Cookie=f"{name}={token}")).status == 401
+
+    run(go())
+
+
+def fill_audit_log(store):
+    """Of all tables this one alone cannot be written."""
+    write(store, "CREATE TRIGGER full BEFORE INSERT ON audit BEGIN SELECT RAISE(ABORT, 'full'); END")
+
+
+def test_a_link_that_was_used_lets_in_although_the_audit_log_cannot_be_written(store):
+    async def go():
+        async with front(store) as door, browser(door) as one:
+            link = passing_link(store, store.accounts.ensure("ann", "annotator"), door.url, once=True)
+            fill_audit_log(store)
+            async with one.session.post(
+                door.url + "/login",
+                data={"token": link.split("token=")[1]},
+                headers={"Origin": door.url},
+            ) as answer:
+                assert (answer.status, answer.url.path) == (200, "/r/1/")
+            assert (await one.get("/r/1/session")).status == 204
+
+    run(go())
+    assert list(store.audit.lines()) == []
+
+
+def test_a_revoked_page_is_closed_although_the_audit_log_cannot_be_written(store, monkeypatch):
+    monkeypatch.setattr(viser_proxy, "_LOOK_S", 0.01)
+    ann = store.accounts.ensure("ann", "annotator").id
+    store.accounts.add_token("session", ann, "session", lasts=timedelta(days=1))
+    for _ in range(2):
+        store.audit.note("ann", "signed in")
+    store.audit._clock = lambda: time.monotonic() + 3600  # the second one is to be written now
+    fill_audit_log(store)
+
+    class Socket:
+        closed = asyncio.Event()
+
+        async def close(self, **why):
+            self.closed.set()
+
+    async def go():
+        proxy, page = viser_proxy.Proxy(Behind(store), store), Socket()
+        await proxy.open()
+        try:
+            proxy._sockets[page] = "session"
+            store.accounts.revoke_tokens(ann)
+            await asyncio.wait_for(page.closed.wait(), 20)
+        finally:
+            await proxy.close()
+
+    run(go())
+    with pytest.raises(sqlite3.IntegrityError, match="full"):
+        store.audit.finish()
 
 
 @pytest.mark.parametrize(

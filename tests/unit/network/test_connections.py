@@ -7,6 +7,7 @@ import logging
 import sys
 import time
 import zlib
+from collections.abc import Sequence
 from contextlib import asynccontextmanager
 
 import pytest
@@ -61,10 +62,10 @@ async def socket(request: web.Request) -> web.StreamResponse:
 
 
 @asynccontextmanager
-async def front(limits: Limits = SMALL, offences: Buckets | None = None):
+async def front(limits: Limits = SMALL, offences: Buckets | None = None, between: Sequence = ()):
     """A front without people or pages: (what holds the connections, how to connect)."""
     guard = Refusals(Listening(), offences or Buckets(0.0, 1000), person)
-    app = web.Application(middlewares=[guard.around, guard.within])
+    app = web.Application(middlewares=[guard.around, *between, guard.within])
     app.add_routes([web.get("/hello", hello), web.get("/much", much), web.get("/socket", socket)])
     app.add_routes([web.post("/take", take), web.post("/json", json)])
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
@@ -177,7 +178,7 @@ def test_somebody_with_a_session_gets_in_while_strangers_hold_every_place():
             mine, me = await connect(GET % MINE)
             assert await status(mine) == 200
             crowd = [
-                await connect(start, from_=f"127.0.0.{2 + n % 10}")
+                await connect(start, from_=f"127.0.0.{2 + n}")
                 for n in range(60)
                 for start in (
                     b"",
@@ -194,6 +195,32 @@ def test_somebody_with_a_session_gets_in_while_strangers_hold_every_place():
             assert await status(newcomer) == 200
             me.write(GET % MINE)
             assert await status(mine) == 200, "somebody with a session was crowded out"
+
+    asyncio.run(go())
+
+
+def test_a_connection_that_was_lost_while_its_request_is_answered_takes_no_place_again():
+    async def go():
+        asked, lost, answered = asyncio.Event(), asyncio.Event(), asyncio.Event()
+
+        @web.middleware
+        async def recognise(request, handler):
+            asked.set()
+            await lost.wait()
+            try:
+                return await handler(request)
+            finally:
+                answered.set()
+
+        async with front(between=[recognise]) as (held, connect), asyncio.timeout(20):
+            _, writer = await connect(GET % MINE)
+            await asked.wait()
+            writer.transport.abort()
+            while list(held._strangers):
+                await asyncio.sleep(0.01)
+            lost.set()
+            await answered.wait()
+            assert not list(held._members) and not list(held._strangers)
 
     asyncio.run(go())
 

@@ -33,6 +33,28 @@ def nothing_to_send(renderer):
     return lambda: 0
 
 
+class TwoFold(Exception):
+    """Is pickled with its text alone, of which it cannot be made again."""
+
+    def __init__(self, one, other):
+        super().__init__(f"{one} and {other}")
+
+
+def raise_two_fold(renderer):
+    raise TwoFold("this", "that")
+
+
+class Unreadable:
+    """Is pickled, and raises when it is read."""
+
+    def __reduce__(self):
+        return refuse, (None,)
+
+
+def unreadable(renderer):
+    return Unreadable()
+
+
 @pytest.fixture(scope="module")
 def drawing():
     with pytest.MonkeyPatch.context() as patch:
@@ -56,6 +78,20 @@ def test_what_goes_wrong_there_is_raised_here_and_the_next_job_is_done(drawing):
     with pytest.raises(RuntimeError, match="nothing_to_send"):
         drawing.submit(nothing_to_send).result(120)
     assert drawing.submit(size).result(120) == (480, 360)
+
+
+def test_an_error_that_cannot_be_read_again_is_told_in_words(drawing):
+    before = drawing.pid
+    with pytest.raises(RuntimeError, match="this and that"):
+        drawing.submit(raise_two_fold).result(120)
+    assert drawing.submit(size).result(120) == (480, 360) and drawing.pid == before
+
+
+def test_after_an_answer_that_cannot_be_read_another_process_takes_over(drawing):
+    before = drawing.pid
+    with pytest.raises(RuntimeError, match="ended with code"):
+        drawing.submit(unreadable).result(120)
+    assert drawing.submit(size).result(120) == (480, 360) and drawing.pid != before
 
 
 def test_a_process_that_dies_fails_its_jobs_and_another_takes_over(drawing):

@@ -1,6 +1,9 @@
 """One run after another under one roof: opened, made, started from another's predictor, and nothing lost."""
 
+import json
+import shutil
 from contextlib import closing
+from dataclasses import asdict
 
 import pytest
 
@@ -9,6 +12,8 @@ from onedemo.app.http.commands import Actions
 from onedemo.app.services import run_manager as module
 from onedemo.app.services.run_manager import Study
 from onedemo.core.files import hold
+from onedemo.demos.ground_truth import hidden_path
+from onedemo.demos.library import find_demo, rename_demo
 from onedemo.errors import UserError
 from onedemo.render.renderer import RenderThread
 from onedemo.storage.store import Store
@@ -58,6 +63,20 @@ def test_another_run_is_opened_and_the_one_before_is_free(study):
         pass
     study.open("first")
     assert study.trainer.run == "first"
+
+
+def test_a_run_is_opened_although_its_demo_was_renamed(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "find_demo", find_demo)
+    demo, demos = study.trainer.demo, tmp_path / "data" / "demos"
+    home = demos / demo.sha256
+    home.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(demo.path, home / "video.webm")
+    shutil.copyfile(hidden_path(demo.path), hidden_path(home / "video.webm"))
+    about = asdict(demo) | {"path": "", "video_sha256": demo.sha256}
+    (home / "demo.json").write_text(json.dumps(about))
+    rename_demo(find_demo("falling", demos), "renamed", demos)
+    study.open("second")
+    assert study.trainer.run == "second" and study.trainer.demo.name == "renamed"
 
 
 def test_a_run_starts_from_the_predictor_of_another(study):

@@ -11,9 +11,9 @@ import pytest
 
 from helpers.small_world import falling_demo, small_config
 from onedemo.app.cli.main import main
-from onedemo.core.files import jpeg_fault
+from onedemo.core.files import jpeg_fault, replacing
 from onedemo.demos.library import find_demo
-from onedemo.render.renderer import Order, RenderThread
+from onedemo.render.renderer import Order, Renderer, RenderThread
 from onedemo.storage.clips import NewClip
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
@@ -165,8 +165,20 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         assert "0.0 MB freed" in capsys.readouterr().out
 
 
+def test_what_is_being_written_is_neither_counted_nor_deleted(tmp_path):
+    with closing(Store(tmp_path)) as store:
+        files = RunDirectory(tmp_path, "r")
+        film, clip = files.path / "rollouts/000001.webm", files.clip(1)
+        with replacing(film, ".webm", sync=False) as half, replacing(clip, ".jpg", sync=False) as other:
+            half.write_bytes(b"half")
+            other.write_bytes(b"half")
+            assert pictures_of(files) == [] and tidy(store, files, 0) == 0
+        assert sorted(path for path, _, _ in pictures_of(files)) == [clip, film]
+        assert tidy(store, files, 0) == 8 and not film.exists()
+
+
 @pytest.mark.seam
-def test_a_film_lets_clips_go_first_and_ends_when_told_to(tmp_path):
+def test_a_film_lets_clips_go_first_and_ends_when_told_to(tmp_path, monkeypatch):
     demo = falling_demo(tmp_path / "demo")
     from onedemo.training.best_rollouts import Gallery
 
@@ -188,13 +200,20 @@ def test_a_film_lets_clips_go_first_and_ends_when_told_to(tmp_path):
         for name, film in (("film 1", films[0]), ("film 2", films[1])):
             film.add_done_callback(lambda _, name=name: order.append(name))
 
-        def in_between(renderer):  # from within the first film on, one clip after another
+        def in_between(renderer):  # one clip after another
             order.append("clip")
             if len(order) < 5:
                 drawing.submit(in_between)
 
         drawing.submit(lambda renderer: order.append("awaited"), Order.AWAITED)
-        drawing.submit(in_between)
+        render, begun_films = Renderer.render, []
+
+        def rendered(renderer, qpos):
+            if not begun_films:
+                begun_films.append(drawing.submit(in_between))  # while the first film is being drawn
+            return render(renderer, qpos)
+
+        monkeypatch.setattr(Renderer, "render", rendered)
         go_on.set()
         assert films[0].result(120).stat().st_size > 1000
         assert order[:2] == ["awaited", "clip"] and order.index("film 1") == 5
