@@ -25,9 +25,9 @@ from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEA
 from onedemo.app.services.demo_images import Pictures, version_of
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study
-from onedemo.app.ui import data_tab, guide_tab, rate_tab, runs_tab, watch_tab
-from onedemo.app.ui.compare_tab import Compare
-from onedemo.app.ui.context import TabContext
+from onedemo.app.tabs import data, guide, rate, runs, watch
+from onedemo.app.tabs.compare import Compare
+from onedemo.app.tabs.context import TabContext
 from onedemo.app.ui.session import Session, TabMaker
 from onedemo.app.ui.viser_private import hang_up, lock_down, request_headers, start_server
 from onedemo.types import Rater
@@ -201,5 +201,5 @@ class Page:
 def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
     """The tabs a role gets, in order; the first one is shown first."""
     if role == "researcher":
-        return [watch_tab.Watch, runs_tab.Runs, rate_tab.Rate, Compare, data_tab.Data, guide_tab.Guide]
-    return [rate_tab.Rate, *([Compare] if compare else []), guide_tab.Guide]
+        return [watch.Watch, runs.Runs, rate.Rate, Compare, data.Data, guide.Guide]
+    return [rate.Rate, *([Compare] if compare else []), guide.Guide]

@@ -27,6 +27,7 @@ ORDER = (
     "app.annotation app.templates app.network",
     "app.dataset app.services app.admin",
     "app.http",
+    "app.tabs",
     "app.ui",
     "app.cli",
 )

@@ -8,7 +8,7 @@ import pytest
 from load.dataset import _RUN, _ask_all, _begin, _fill, _press
 from onedemo.app.annotation.agreement import quality, quality_by_rater, rating_rows
 from onedemo.app.dataset.csv_writer import csv_blocks
-from onedemo.app.ui.data_tab import data_html
+from onedemo.app.tabs.data import data_html
 from onedemo.storage.rating_records import RATING_COLUMNS
 from onedemo.storage.store import Store
 

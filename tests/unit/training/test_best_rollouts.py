@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.small_world import falling_demo, falling_states
-from onedemo.app.ui.progress import chosen, gallery_html, timeline_html
+from onedemo.app.tabs.progress import chosen, gallery_html, timeline_html
 from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.rollouts import Transitions

@@ -9,9 +9,9 @@ from typing import Any
 from markupsafe import Markup
 
 from onedemo.app.http.uploads import LARGEST
+from onedemo.app.tabs import charts
+from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
-from onedemo.app.ui import charts
-from onedemo.app.ui.context import TabContext
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
 from onedemo.types import HALTED, Status

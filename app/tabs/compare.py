@@ -10,10 +10,10 @@ from typing import Any
 
 from onedemo.app.annotation import presses
 from onedemo.app.annotation.comparison_session import ComparisonSession
+from onedemo.app.tabs.context import TabContext
+from onedemo.app.tabs.pressing import Pressing
+from onedemo.app.tabs.strings import COMPARE_KEYS, keys_dialog
 from onedemo.app.templates import render
-from onedemo.app.ui.context import TabContext
-from onedemo.app.ui.session import Pressing
-from onedemo.app.ui.strings import COMPARE_KEYS, keys_dialog
 from onedemo.types import Status
 
 

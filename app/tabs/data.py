@@ -13,8 +13,8 @@ from markupsafe import Markup
 
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.annotation.scale import ANSWERS
+from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
-from onedemo.app.ui.context import TabContext
 from onedemo.storage.rating_records import SKIP_COLUMNS
 from onedemo.types import Rater, Status
 

@@ -14,9 +14,9 @@ from mjviser import ViserMujocoScene
 
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.services.live_rollout import Moment
+from onedemo.app.tabs import charts, progress
+from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
-from onedemo.app.ui import charts, progress
-from onedemo.app.ui.context import TabContext
 from onedemo.types import HALTED, Status
 
 _DEMO_HZ = 15.0

@@ -8,10 +8,10 @@ import threading
 from markupsafe import Markup
 
 from onedemo.app.annotation.scale import ANSWERS, MEANINGS
+from onedemo.app.tabs.clip_player import example_address, player_html
+from onedemo.app.tabs.context import TabContext
+from onedemo.app.tabs.strings import RATE_KEYS
 from onedemo.app.templates import render
-from onedemo.app.ui.clip_player import example_address, player_html
-from onedemo.app.ui.context import TabContext
-from onedemo.app.ui.strings import RATE_KEYS
 from onedemo.errors import UserError
 from onedemo.types import Status
 

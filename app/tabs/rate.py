@@ -11,11 +11,11 @@ from typing import Any
 from onedemo.app.annotation import presses
 from onedemo.app.annotation.rating_session import RatingSession
 from onedemo.app.annotation.scale import ANSWERS, REASONS
+from onedemo.app.tabs.clip_player import example_address
+from onedemo.app.tabs.context import TabContext
+from onedemo.app.tabs.pressing import Pressing
+from onedemo.app.tabs.strings import RATE_KEYS, keys_dialog
 from onedemo.app.templates import render
-from onedemo.app.ui.clip_player import example_address
-from onedemo.app.ui.context import TabContext
-from onedemo.app.ui.session import Pressing
-from onedemo.app.ui.strings import RATE_KEYS, keys_dialog
 from onedemo.types import Status
 
 _MIDDLE = 3
