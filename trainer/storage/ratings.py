@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from onedemo.storage.database import Database, now
+from onedemo.storage.rating_counts import Counting, Counts
 from onedemo.storage.rating_records import (
     LOOKED_BACK,
     MOST_REASON,
@@ -23,6 +24,7 @@ class Ratings:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._counting = Counting(database)
 
     def rate(
         self, clip_id: int, rater_id: int, value: int, latency_ms: int, *,
@@ -289,6 +291,10 @@ class Ratings:
             "SELECT rater_id, SUM(ratings) FROM tallies WHERE run = ? GROUP BY rater_id", (run,)
         )
         return sum(ratings for rater, ratings in rows if rater not in left_out)
+
+    def counts(self, run: str) -> dict[int, Counts]:
+        """What each rater has given in a run, by number; ``sum(counts.values(), Counts())`` is all."""
+        return self._counting.of(run, self.left_out(run))
 
     def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
         """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""
