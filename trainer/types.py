@@ -145,7 +145,7 @@ class Rater:
     """One of ``ROLES``."""
 
 
-HALTED = ("paused", "failed", "stopped")
+HALTED = ("pausing", "paused", "failed", "stopping", "stopped")
 """Phases from which a run may be told to go on."""
 
 
@@ -154,9 +154,13 @@ class Status:
     """What the trainer is doing, as of now; the page shows it."""
 
     phase: str
-    """"starting", "pretrain", "online", "paused", "done", "stopped" or "failed"."""
-    message: str
-    """One plain sentence for people who do not know what a policy is."""
+    """"starting", "pretrain", "online", "pausing", "paused", "stopping", "stopped", "done" or "failed"."""
+    message: str = ""
+    """What it is starting with, one plain sentence; the page says the rest (``app/annotation/phases.py``)."""
+    progress: float | None = None
+    """How much of starting is done, 0 to 1; None if that is not known."""
+    left_s: float | None = None
+    """Seconds until it has started, from how fast it went so far; None if that is not known."""
     method: str = ""
     """How the run learns: "onedemo" or "paper"."""
     error: str = ""
@@ -180,4 +184,4 @@ class Status:
     target_ratings: int = 0
     """Ratings asked for in all."""
     next_clips_s: float | None = None
-    """Seconds until new clips are expected, None if not known."""
+    """Seconds until the iteration ends, and with it new clips are expected; None if not known."""

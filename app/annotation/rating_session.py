@@ -79,6 +79,8 @@ class RatingSession:
         self._skipped: Ask | None = None
         self.explained = False
         """Whether the reason of the last skip was said, until the next press."""
+        self.taken = False
+        """Whether there are clips, but others have them on their screens, so that none is here."""
         self.taken_back: LastAnswer | None = None
         """What was answered to the clip on screen before it was taken back."""
 
@@ -255,6 +257,7 @@ class RatingSession:
 
         Nothing is asked again while nothing fresh waits: people would go on beyond what was asked for.
         """
+        self.taken = False
         if not waiting:
             return None
         if self._kind != "fresh":
@@ -267,6 +270,7 @@ class RatingSession:
             if clip is not None:
                 return Ask(clip, kind)
         clip = self._take(waiting)
+        self.taken = clip is None
         return Ask(clip) if clip is not None else None
 
     def _waiting(self) -> list[int]:

@@ -10,6 +10,7 @@ from typing import Any
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SEGMENTS, SKIPS, as_table
+from onedemo.storage.rating_counts import Counts
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
 
@@ -67,7 +68,7 @@ def _run(store: Store, entry: dict[str, Any]) -> str:
     people = {rater.name: rater for rater in store.accounts.raters()}
     rows = rating_rows(store, run)
     whole, each = quality(rows), quality_by_rater(rows)
-    left_out = store.ratings.left_out(run)
+    left_out, counts = store.ratings.left_out(run), sum(store.ratings.counts(run).values(), Counts())
     classes = map(str, range(1, 6))
     heads = ("rater", "role", "ratings", *classes, "alpha", "same on repeats", "median s", "note")
     lines = [_line(("all", "", *_figures(whole), ""))]
@@ -79,6 +80,9 @@ def _run(store: Store, entry: dict[str, Any]) -> str:
         f"### {_text(run)}\n\nDemonstration {_text(entry['demo'])} (SHA-256 "
         f"{_text(entry['demo_sha256'][:16])}…), seed {_text(entry['seed'])}, "
         f"made {_text(entry['created_at'])} with onedemo {_text(entry['version'])}.\n\n"
+        f"{counts.given} ratings given, a row each in the CSV: {counts.used} used for training, "
+        f"{counts.repeats} repeats, {counts.excluded} of excluded raters. Beside them "
+        f"{counts.skipped} skipped clips and {counts.withdrawn} withdrawn ratings.\n\n"
         + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n" + _withdrawn(store, run)
     )  # fmt: skip
 

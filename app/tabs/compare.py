@@ -10,6 +10,7 @@ from typing import Any
 
 from onedemo.app.annotation import presses
 from onedemo.app.annotation.comparison_session import ComparisonSession
+from onedemo.app.annotation.phases import waiting_for_pairs
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.tabs.pressing import Pressing
 from onedemo.app.tabs.strings import COMPARE_KEYS, keys_dialog
@@ -30,7 +31,7 @@ class Compare(Pressing):
             context.store, context.run, context.rater, context.pair_assignment, context.client.client_id,
             guard_seconds=context.guard_seconds,
         )  # fmt: skip
-        self._message = ""
+        self._status = context.training.status()
         gui = context.client.gui
         self._top, self._stage = gui.add_html(""), gui.add_html("")
         self._answers, self._tools = gui.add_html(""), gui.add_html("")
@@ -51,7 +52,7 @@ class Compare(Pressing):
         """Asks for pairs while somebody looks."""
         with self._lock:
             if self._shown:
-                self._message = status.message
+                self._status = status
                 self._context.training.want_pairs()
                 self._comparing.refill()
                 self._draw()
@@ -79,7 +80,8 @@ class Compare(Pressing):
                     ahead=self._address(self._comparing.upcoming), fps=context.demo.fps,
                 )  # fmt: skip
             else:
-                stage = render("compare.html:waiting", message=self._message)
+                told = waiting_for_pairs(self._status, researcher=context.rater.role == "researcher")
+                stage = render("parts.html:waiting", told=told)
             self._put(self._stage, stage)
             self._put(self._answers, render("compare.html:answers") if shown else "")
             self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))

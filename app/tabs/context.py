@@ -31,8 +31,8 @@ class Training(Protocol):
         """Lets it go on."""
         ...
 
-    def stop(self) -> None:
-        """Ends it."""
+    def stop(self, timeout_s: float = 60.0) -> None:
+        """Ends it after the iteration in hand; waits for that so long."""
         ...
 
     def want_pairs(self) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import Mapping
 from urllib.parse import quote
 
@@ -15,7 +14,7 @@ from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater,
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
-from onedemo.storage.rating_records import SKIP_COLUMNS
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import Rater, Status
 
 log = logging.getLogger("onedemo.page")
@@ -67,12 +66,12 @@ class Data:
         try:
             store, run = self._store, self._run
             rows = rating_rows(store, run)
-            skips = Counter(row[SKIP_COLUMNS.index("rater")] for row in store.ratings.stream_skips(run))
             people = {rater.name: rater for rater in store.accounts.raters()}
+            names = {rater.id: name for name, rater in people.items()}
+            given = {names[who]: c for who, c in store.ratings.counts(run).items() if c != Counts()}
             figures = data_html(
-                run, method, store.ratings.tallies(run), quality(rows), quality_by_rater(rows, raters=skips),
-                skips,
-                people, store.ratings.left_out(run),
+                run, method, store.ratings.tallies(run), quality(rows), quality_by_rater(rows, raters=given),
+                given, people, store.ratings.left_out(run),
             )  # fmt: skip
             self._html.content = str(figures)
             self._counted, self._counted_at = event, time.monotonic()
@@ -84,7 +83,7 @@ class Data:
 
 def data_html(
     run: str, method: str, counts: Mapping[tuple[str, str], list[int]], whole: Quality,
-    each: Mapping[str, Quality], skips: Mapping[str, int], people: Mapping[str, Rater], left_out: set[int],
+    each: Mapping[str, Quality], given: Mapping[str, Counts], people: Mapping[str, Rater], left_out: set[int],
 ) -> Markup:  # fmt: skip
     """The tab's figures.
 
@@ -94,15 +93,13 @@ def data_html(
         counts: As ``Store.ratings.tallies``.
         whole: Quality of all ratings.
         each: Of each rater's, by name.
-        skips: Clips that each skipped, by name.
+        given: How many ratings each has given, by name.
         people: Raters by name.
         left_out: Raters whose ratings nothing learns from.
     """
     return render(
-        "data.html:ratings", run=run, method=method, tallies=counts, whole=whole, each=each, skips=skips,
-        people=people, left_out=left_out, answers=ANSWERS,
-        counts=[sum(row[value] for row in counts.values()) for value in range(5)],
-        learned=sum(sum(row) for (name, _), row in counts.items() if people[name].id not in left_out),
+        "data.html:ratings", run=run, method=method, tallies=counts, whole=whole, each=each, given=given,
+        people=people, left_out=left_out, answers=ANSWERS, counts=sum(given.values(), Counts()),
     )  # fmt: skip
 
 

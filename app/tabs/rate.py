@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from onedemo.app.annotation import presses
+from onedemo.app.annotation.phases import waiting
 from onedemo.app.annotation.rating_session import RatingSession
 from onedemo.app.annotation.scale import ANSWERS, REASONS
 from onedemo.app.tabs.clip_player import example_address
@@ -16,6 +17,7 @@ from onedemo.app.tabs.context import TabContext
 from onedemo.app.tabs.pressing import Pressing
 from onedemo.app.tabs.strings import RATE_KEYS, keys_dialog
 from onedemo.app.templates import render
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import Status
 
 _MIDDLE = 3
@@ -108,17 +110,20 @@ class Rate(Pressing):
     def _draw_clip(self) -> None:
         context, rating, status = self._context, self._rating, self._status
         clip, target = rating.current, status.target_ratings
-        count = context.store.ratings.count_for_training(context.run)  # as many as the trainer counts
+        each = context.store.ratings.counts(context.run)
+        everybody, own = sum(each.values(), Counts()), each.get(context.rater.id, Counts()).given
         shown = clip is not None
-        self._put(self._top, render("rate.html:top", count=count, target=target, shown=shown))
+        top = render("rate.html:top", own=own, counts=everybody, target=target, shown=shown)
+        self._put(self._top, top)
         if shown:
             source, fps = self._address(clip), context.demo.fps
             stage = render("rate.html:clip", number=clip, source=source, fps=fps, mark=rating.mark)
         else:
-            done = 0 < target <= count
-            stage = render(
-                "rate.html:waiting", done=done, message=status.message, seconds=status.next_clips_s
-            )
+            told = waiting(
+                status, used=everybody.used, taken=rating.taken,
+                researcher=context.rater.role == "researcher",
+            )  # fmt: skip
+            stage = render("parts.html:waiting", told=told)
         self._put(self._stage, stage)
         undoable = rating.undoable
         undo = {"data-undo-clip": undoable} if undoable else None

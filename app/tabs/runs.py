@@ -8,12 +8,14 @@ from typing import Any
 
 from markupsafe import Markup
 
+from onedemo.app.annotation.phases import NAMES
 from onedemo.app.http.uploads import LARGEST
 from onedemo.app.tabs import charts
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.config import METHODS
 from onedemo.demos.library import list_demos
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
 
 _NEWEST = 6
@@ -95,7 +97,8 @@ class Runs:
             name = run["id"]
             rows = self._rows.get(name)
             last = rows[-1] if rows else (self._store.runs.last_iteration(name) or {})
-            figures[name] = {"ratings": sum(self._store.ratings.by_class(name)), **last}
+            counts = sum(self._store.ratings.counts(name).values(), Counts())
+            figures[name] = {"ratings": counts, **last}
         return figures
 
 
@@ -134,7 +137,7 @@ def runs_html(
 
     Args:
         runs: As ``Store.runs.all``.
-        figures: Of each: ``ratings``, and the newest iteration's.
+        figures: Of each: ``ratings``, as ``Counts``, and the newest iteration's.
         current: The one that is served.
         status: Of that one.
         drawn: Those whose curves are drawn.
@@ -142,7 +145,8 @@ def runs_html(
     return render(
         "runs.html:table",
         rows=[(run, figures[run["id"]], method_of(run["config"])) for run in reversed(runs)],
-        current=current, status=status, resumable=status.phase in HALTED, drawn=drawn,
+        current=current, status=status, phase=NAMES[status.phase],
+        resumable=status.phase in HALTED, drawn=drawn,
     )  # fmt: skip
 
 

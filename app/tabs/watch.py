@@ -12,11 +12,13 @@ import mujoco
 from markupsafe import Markup
 from mjviser import ViserMujocoScene
 
+from onedemo.app.annotation.phases import NAMES, told
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.services.live_rollout import Moment
 from onedemo.app.tabs import charts, progress
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
 
 _DEMO_HZ = 15.0
@@ -90,13 +92,13 @@ class Watch:
                 return
             self._practised = status.iteration > 0
             store, run = self._store, self._run
-            counts = store.ratings.by_class(run)
+            counts = sum(store.ratings.counts(run).values(), Counts())
             strip = render(
-                "watch.html:strip", status=status, confirming=time.monotonic() < self._confirm_until,
-                ratings=sum(counts), learned=store.ratings.count_for_training(run),
+                "watch.html:strip", status=status, phase=NAMES[status.phase], told=told(status),
+                counts=counts, confirming=time.monotonic() < self._confirm_until,
             )  # fmt: skip
             self._put(self._strip, strip)
-            self._put(self._classes, render("parts.html:classes", counts=counts, answers=ANSWERS))
+            self._put(self._classes, render("parts.html:classes", counts=counts.classes, answers=ANSWERS))
             new = store.runs.iterations(run, after=self._charts.last)
             self._charts.extend(new)
             if new:
@@ -130,7 +132,7 @@ class Watch:
             self._confirm_until = 0.0 if sure else time.monotonic() + _CONFIRM_SECONDS
         if sure:
             self._log("stopped the run")
-            self._training.stop()
+            self._training.stop(timeout_s=0)  # within its iteration it is shown to be stopping
         self.refresh(self._training.status())
 
     def _log(self, what: str) -> None:

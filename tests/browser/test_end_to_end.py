@@ -136,7 +136,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     ]
     assert rows(data_dir) == before
     with opened(chromium, again["annotator"]) as page:
-        page.wait_for_selector(f".od-progress >> text={len(before)} of 45")
+        page.wait_for_selector(f".od-progress >> text=Everybody: {len(before)} of 45")
         rate(page, data_dir, 5)
     until(lambda: iterations(data_dir) > done, 90)
     with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:

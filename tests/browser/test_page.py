@@ -139,7 +139,7 @@ def test_annotator_rates_by_key_button_and_slider_and_researcher_downloads_it(ch
             expected.append((clip, value))
             assert press_and_wait(page, site, act) == ("rate", clip, value, "bo")
         assert len(set(expected)) == 5
-        page.wait_for_selector(".od-progress >> text=5 of 200")
+        page.wait_for_selector(".od-progress >> text=Everybody: 5 of 200")
         assert page.request.get(f"{site.url}/export.csv").status == 403
     with opened(chromium, site.links["researcher"], SMALL) as page:
         page.click('.od-tabs >> text="Data"')
@@ -305,11 +305,12 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         page.wait_for_timeout(GUARD_MS)
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         page.wait_for_selector(".od-problem", state="detached")
-        site.trainer.set_status(phase="online", message="The robot is practising.", next_clips_s=20.0)
+        site.trainer.set_status(phase="online", iteration=2, next_clips_s=20.0)
         store.clips.set_state([c.id for c in store.clips.waiting(site.trainer.run)], "withdrawn")
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
-        page.wait_for_selector("text=The robot is practising. New pairs in about 20 s.")
+        page.wait_for_selector("text=The robot is practising, and new clips show what it does.")
+        page.wait_for_selector("text=New clips in about 20 s.")
         (new,) = site.trainer.add_clips(1)
         assert shown_clip(page) == new
         site.trainer.set_status(target_ratings=3)

@@ -159,7 +159,7 @@ class StandIn:
         self.calls.append("resume")
         self.set_status(phase="online")
 
-    def stop(self) -> None:
+    def stop(self, timeout_s: float = 60.0) -> None:
         self.calls.append("stop")
         self.set_status(phase="stopped")
 

@@ -75,6 +75,13 @@ class RatingQueue:
         """Valid ratings that are used for training."""
         return self._store.ratings.count_for_training(self._run)
 
+    def asked(self, iteration: int) -> int:
+        """Ratings that people are asked for so far, in all, after so many iterations.
+
+        Those that are about the policy wait until there are clips of it: the first iteration makes them.
+        """
+        return self.target if iteration else self._config.ratings.pretrain
+
     def fill(self, learner: Learner, pool: Rollouts | None, snapshot: Snapshot | None) -> None:
         """Cuts clips; in place of those that a simulated rater declines it cuts others.
 
@@ -118,7 +125,6 @@ class RatingQueue:
         """Cuts as many clips as are missing from the queue; True if some still are.
 
         A few at a time, because one alone cannot be a mix of kinds (``trainer/queries/selection.py``).
-        While the first iteration runs people go on with random motion, so that nobody waits.
         """
         if self.clips is not None:
             self.clips.retry()
@@ -162,7 +168,7 @@ class RatingQueue:
         if self._simulated is not None:
             return self._due(learner, snapshot) - given
         wanted = max(self._config.ratings.queue, 2 * self._ratings_an_iteration(learner.iteration, given))
-        queue = min(wanted, self.target - given)
+        queue = min(wanted, self.asked(learner.iteration) - given)
         return queue - len(waiting) if len(waiting) <= _FULL * queue else 0
 
     def _ratings_an_iteration(self, iteration: int, given: int) -> int:

@@ -23,17 +23,6 @@ _TICK_S = 0.2
 """How often the thread looks for ratings while it has nothing to compute."""
 _PRETRAIN_REFIT = 10
 """New ratings between two refits while the policy is not trained yet."""
-_MESSAGES = {
-    "pretrain": "So far the robot moves at random. It starts training once it has {} ratings.",
-    "online": "The robot is practising with what it learned from your ratings.",
-    "paused": "Practice is paused. Ratings still count.",
-    "done": "The robot has practised as long as it was told to.",
-    "stopped": "The run is stopped. It can be started again where it was.",
-    "lost": "Nothing that is said now is kept. Please stop, and tell the researcher.",
-    "failed": (
-        "The robot has stopped practising, and soon tries again. Your ratings are kept, and still count."
-    ),
-}
 
 
 class _Stopped(Exception):
@@ -75,6 +64,7 @@ class Trainer:
         self._first_rest_s, self._longest_rest_s = rest_s
         self._rest_s = self._first_rest_s
         self._work_began = self._work_s = 0.0
+        self._work_of = ""  # the phase in which it took that long
         self._phase, self._error = "starting", ""
         self._next_phase = ""  # of a try after a failure, shown once it has gone well
 
@@ -137,15 +127,22 @@ class Trainer:
         """What the thread is doing, as of now."""
         training, config, phase = self._training, self.config, self._phase
         next_clips = None
-        if phase in ("pretrain", "online") and self._work_s:
+        if phase == self._work_of:
             next_clips = max(1.0, self._work_s - (time.monotonic() - self._work_began))
+        progress, left = training.looking() if phase == "starting" else (None, None)
+        message = training.preparing if phase == "starting" else ""
         clips, snapshot, lost = training.queue.clips, training.snapshot, self.store.database.fault
         if lost:
             phase = "failed"
-        message = _MESSAGES.get("lost" if lost else phase, training.preparing)
+        elif self._stop.is_set() and self._working:
+            phase = "stopping"
+        elif self._pause.is_set() and phase in ("starting", "pretrain", "online"):
+            phase = "pausing" if phase == "online" else "paused"
         return Status(
             phase=phase,
-            message=message.format(config.ratings.pretrain),
+            message=message,
+            progress=progress,
+            left_s=left,
             method=config.method,
             saved=not lost,
             error=lost or self._error or (clips.error if clips is not None else ""),
@@ -165,7 +162,7 @@ class Trainer:
     def _start(self) -> None:
         self._retired = False
         if self._phase == "stopped":
-            self._training.preparing = "The run continues from its last checkpoint."
+            self._training.preparing = "The run continues from where it was."
             self._phase = "starting"
         # Each thread has an event of its own: one that has not ended yet is not told to go on.
         self._stop, before = threading.Event(), self._thread
@@ -220,7 +217,7 @@ class Trainer:
             if phase == "online":
                 training.iterate()
             if phase == "online" or (phase == "pretrain" and training.refit(at_least=_PRETRAIN_REFIT)):
-                self._work_s = time.monotonic() - self._work_began
+                self._work_s, self._work_of = time.monotonic() - self._work_began, phase
             if phase != "online":
                 stop.wait(_TICK_S)
             self._went_well()

@@ -46,6 +46,8 @@ from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 _TIDY_S = 10.0
 """Between two looks at what pictures can be deleted."""
+_TOLD_FROM = 0.02
+"""Share of the work from which on its pace tells how long the rest takes."""
 
 
 class _Drawn(NamedTuple):
@@ -109,8 +111,11 @@ class TrainingRun:
         """Of the last iteration that is in the database."""
         self.steps_per_s = 0.0
         """Control steps per second in the last iteration."""
-        self.preparing = "Looking at the video for the first time."
-        """What ``look`` does, one sentence."""
+        self.preparing = "The run is being opened."
+        """What comes before the first ``step``: what is done of it now, one sentence."""
+        self.track: Track | None = None
+        """What the demo shows of the robot, as far as is known; None before ``see``, or if it shows none."""
+        self._learning: tuple[float, float] | None = None
         self._encoder, self._learn_robot = encoder, learn_robot
         self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
         self._drawn: _Drawn | None = None
@@ -168,16 +173,38 @@ class TrainingRun:
             Features of the demo's frames, (F, D), and what they show of the robot, if that can be told.
         """
         torch.set_num_threads(self.config.rollouts.threads)
+        self.preparing = "The demonstration video is looked at."
         features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
         if not self.config.predictor.appearance:
             return features, None
-        self.preparing = "Looking at pictures of the robot: about a minute, the first time only."
-        look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", check)
+        began = time.monotonic()
+
+        def note(share: float = 0.0) -> None:  # never called if it was learned before
+            self.preparing = "Pictures of the robot are looked at, so that its pose can be told."
+            self._learning = began, share
+            check()
+
+        try:
+            look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", note)
+        finally:
+            self._learning = None
         return features, look.track(features, self.demo.fps) if look.knows(features) else None
+
+    def looking(self) -> tuple[float | None, float | None]:
+        """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.
+
+        Any thread may ask.
+        """
+        if (learning := self._learning) is None:
+            return None, None
+        began, share = learning
+        spent = time.monotonic() - began
+        return share, spent / share - spent if share >= _TOLD_FROM else None
 
     def see(self, features: np.ndarray, track: Track | None) -> None:
         """Takes in what ``look`` found; from then on ``refit`` and ``iterate`` work."""
         torch.set_num_threads(1)
+        self.track = track
         self._opened.look_at(features, track)
         self._policy = self._opened.policy()
 

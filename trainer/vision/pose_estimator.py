@@ -35,6 +35,8 @@ _STANDING = 0.25
 _MEMBERS = 3
 _BATCH = 64
 _RATE = 2e-3
+_DRAWING = 0.7
+"""Share of the time that drawing and encoding the pictures takes, as measured."""
 _DROPPED = 0.2
 _NOISE = 0.1
 _VERSION = 4  # raise it when what is drawn or how it is learned changes
@@ -103,12 +105,12 @@ class PoseEstimator:
         )
 
 
-def _go_on() -> None:
+def _go_on(share: float) -> None:
     """Lets everything run to its end."""
 
 
 def learn(
-    env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[], None] = _go_on, *,
+    env_name: str, encoder: Encoder, cache_dir: Path, check: Callable[[float], None] = _go_on, *,
     count: int = 4000, epochs: int = 25,
 ) -> PoseEstimator:  # fmt: skip
     """Learns what the robot looks like, or takes what was learned before.
@@ -117,7 +119,7 @@ def learn(
         env_name: The robot.
         encoder: Looks at the pictures.
         cache_dir: Where it is kept, by robot and encoder.
-        check: Called every now and then; what it raises ends the learning.
+        check: Called every now and then with the share that is done; what it raises ends the learning.
         count: Pictures to learn from, where it is not known yet.
         epochs: Passes over them.
 
@@ -138,7 +140,7 @@ def learn(
 
 
 def pictures(
-    env_name: str, encoder: Encoder, count: int, check: Callable[[], None] = _go_on
+    env_name: str, encoder: Encoder, count: int, check: Callable[[float], None] = _go_on
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws and encodes what random actions do from random and from standing starts.
 
@@ -158,8 +160,8 @@ def pictures(
     with RenderThread() as drawing:  # a thread of its own: those of the encoder take turns at asking
 
         def drawn() -> Iterator[np.ndarray]:
-            for q in qpos:
-                check()
+            for number, q in enumerate(qpos):
+                check(_DRAWING * number / len(qpos))
                 yield drawing.render(q[None]).result()[0]
 
         features = encoder.encode(drawn())
@@ -167,7 +169,7 @@ def pictures(
 
 
 def regress(
-    features: np.ndarray, poses: np.ndarray, check: Callable[[], None] = _go_on, *, epochs: int = 25
+    features: np.ndarray, poses: np.ndarray, check: Callable[[float], None] = _go_on, *, epochs: int = 25
 ) -> PoseEstimator:
     """Fits the networks; the last tenth of the pictures is held out and judges them.
 
@@ -177,7 +179,8 @@ def regress(
     Args:
         features: (n, D).
         poses: (n, P).
-        check: Called before each pass over the pictures; what it raises ends the fit.
+        check: Called before each pass over the pictures with the share that is done, counting the drawing
+            of them; what it raises ends the fit.
         epochs: Passes over the pictures.
     """
     threads = torch.get_num_threads()
@@ -189,7 +192,7 @@ def regress(
 
 
 def _regress(
-    features: np.ndarray, poses: np.ndarray, check: Callable[[], None], epochs: int
+    features: np.ndarray, poses: np.ndarray, check: Callable[[float], None], epochs: int
 ) -> PoseEstimator:
     generator = torch.Generator().manual_seed(_SEED)
     mean, std = features.mean(axis=0), features.std(axis=0) + 1e-3
@@ -202,8 +205,8 @@ def _regress(
         _draw_weights(net, generator)
         optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=1e-2, fused=True)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
-        for _ in range(epochs):
-            check()
+        for epoch in range(epochs):
+            check(_DRAWING + (1 - _DRAWING) * (member + epoch / epochs) / _MEMBERS)
             for index in torch.randperm(train, generator=generator).split(_BATCH):
                 seen = inputs[index]
                 # Features that are missing or off must not matter: dropout and noise of our own generator.

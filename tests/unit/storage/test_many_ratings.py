@@ -96,10 +96,13 @@ def test_the_data_tab_shows_the_tallies(store):
     _fill(store.path, 0, 500)
     rows = rating_rows(store, _RUN)
     people = {rater.name: rater for rater in store.accounts.raters()}
+    names = {rater.id: name for name, rater in people.items()}
+    given = {names[rater]: counts for rater, counts in store.ratings.counts(_RUN).items()}
     html = data_html(
-        _RUN, "onedemo", store.ratings.tallies(_RUN), quality(rows), quality_by_rater(rows), {}, people, set()
-    )
-    assert "500 ratings" in html
+        _RUN, "onedemo", store.ratings.tallies(_RUN), quality(rows), quality_by_rater(rows), given, people,
+        set(),
+    )  # fmt: skip
+    assert "500 given: 500 used for training" in html
     row = '<th scope="row">rater 3</th><td>pretrain</td>'
     cells = store.ratings.tallies(_RUN)["rater 3", "pretrain"]
     assert row + "".join(f"<td>{cell or '·'}</td>" for cell in cells) + f"<td><b>{sum(cells)}</b>" in html

@@ -238,7 +238,7 @@ def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, de
     wait_for(lambda: trainer_.status().snapshot == 1)
     trainer_.stop(timeout_s=0.01)
     trainer_.release()
-    assert trainer_.status().phase == "online" and trainer_.status().iteration == 0
+    assert trainer_.status().phase == "stopping" and trainer_.status().iteration == 0
     assert held_by_another(training.files.lock)
     with pytest.raises(UserError, match="another onedemo is working on"), hold(training.files.lock):
         pass
