@@ -19,14 +19,17 @@
   // The page's own address without the person: what links begin with if nobody says otherwise.
   const address = () => location.origin + location.pathname.replace(/\/r\/\d+\/.*$/, "");
 
+  // Viser draws everything anew when a phone is turned: the links must not go with that.
+  let made = [];
+
   async function invite(fields, place) {
     const note = place.querySelector(".od-form-note");
     note.textContent = "";
     try {
       const answer = await act("invite", fields);
-      const parts = new DOMParser().parseFromString(await answer.text(), "text/html").body.childNodes;
+      made = [...new DOMParser().parseFromString(await answer.text(), "text/html").body.childNodes];
       const links = place.querySelector(".od-invited");
-      links.replaceChildren(...parts);
+      links.replaceChildren(...made);
       links.scrollIntoView({ block: "nearest" });
       return true;
     } catch (error) {
@@ -131,8 +134,14 @@
         () => say(button, "Select it and copy it"),
       );
     } else if ("save" in data) save(linksIn(button.closest(".od-links")));
-    else if ("linksClose" in data) button.closest(".od-invited").replaceChildren();
-    else if (data.relink) {
+    else if ("qr" in data) {
+      const code = button.nextElementSibling;
+      code.hidden = !code.hidden;
+      button.setAttribute("aria-expanded", !code.hidden);
+    } else if ("linksClose" in data) {
+      made = [];
+      button.closest(".od-links").remove();
+    } else if (data.relink) {
       const place = document.querySelector('[data-place="invite"]');
       const { value } = place.querySelector("[name=address]");
       invite({ names: data.relink, role: data.role, expires: "", once: false, address: value }, place);
@@ -146,7 +155,10 @@
   document.addEventListener("focusin", (event) => (focused = within(event, ".od-data button")));
   new MutationObserver(() => {
     const place = document.querySelector("[data-invite] [name=address]:not([placeholder])");
-    if (place) place.placeholder = address();
+    if (place) {
+      place.placeholder = address();
+      place.closest(".od-invite").querySelector(".od-invited").replaceChildren(...made);
+    }
     if (!focused || focused.isConnected) return;
     const { dataset } = focused;
     focused = null;

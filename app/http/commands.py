@@ -24,7 +24,7 @@ class Actions:
     def __init__(self, page: Any) -> None:
         self._page = page
 
-    def do(self, who: Rater, body: Any, address: str) -> Markup | None:
+    def do(self, who: Rater, body: Any, address: str = "") -> Markup | None:
         """Does what a browser asks for: ``{"do": name, ...}``; what it answers is for whoever asked alone.
 
         Args:
