@@ -43,6 +43,7 @@
       body.closest(".od-scroll").hidden = !body.children.length;
       note.textContent = body.children.length ? "" : "There are no such ratings yet.";
       offer(form.elements.of, raters);
+      offerBoxes(raters);
     } catch (error) {
       note.textContent = line.unanswered(error) ? "There is no answer from the server. Try again." : error.message;
     }
@@ -55,26 +56,58 @@
     select.value = value;
   }
 
-  async function open(place, { event, clip, value, rater, repeat, created_at, withdrawn, by }) {
+  // The raters of the filter below, each with a box to tick.
+  function offerBoxes(raters) {
+    const boxes = document.querySelector("[data-filter] .od-choose fieldset");
+    const there = new Set([...boxes.querySelectorAll("input")].map(({ value }) => value));
+    for (const name of raters.filter((one) => !there.has(one))) {
+      const label = element("label");
+      label.append(element("input", "", { type: "checkbox", name: "rater", value: name }), name);
+      boxes.append(label);
+    }
+  }
+  function sayChosen(boxes) {
+    const names = [...boxes.querySelectorAll("input:checked")].map(({ value }) => value);
+    const summary = boxes.closest("details").querySelector("summary");
+    summary.textContent = names.length > 1 ? `${names.length} raters` : (names[0] ?? "anybody");
+  }
+
+  function open(place, { event, clip, value, rater, repeat, created_at, withdrawn, by }) {
     const dialog = place.querySelector("dialog");
-    const seen = dialog.querySelector(".od-look");
     const [title, about, note] = ["h2", ".od-about", ".od-form-note"].map((part) => dialog.querySelector(part));
     const { answers, clips } = dialog.dataset;
     title.textContent = `${rater}: ${value}, ${answers.split("|")[value - 1]}`;
-    about.textContent = `Rating ${event} of clip ${clip}, ${time(created_at)} UTC${repeat ? ", asked again" : ""}`;
+    about.textContent = `Rating ${event} of clip ${clip}, ${time(created_at)} UTC${repeat ? ", asked again" : ""}.`;
     note.textContent = withdrawn === null ? "" : `Withdrawn${by ? ` by ${by}` : ""}: ${withdrawn}`;
     const form = dialog.querySelector("[data-withdraw]");
     form.hidden = withdrawn !== null;
     form.reset();
     form.elements.rating.value = event;
+    play(dialog, clip, clips);
+  }
+
+  // A clip in a dialog that opens with it.
+  async function play(dialog, clip, clips) {
+    const [seen, about] = [dialog.querySelector(".od-look"), dialog.querySelector(".od-about")];
     seen.replaceChildren();
     dialog.showModal();
     const source = clips.replace("CLIP", clip);
     const there = await fetch(source).then(({ ok }) => ok, () => false);
-    if (!there) return (about.textContent += ". Its picture cannot be shown now.");
-    const player = dialog.querySelector("template").content.firstElementChild.cloneNode(true);
+    if (!there) return (about.textContent += " Its picture cannot be shown now.");
+    const template = dialog.closest(".od-given").querySelector("template");
+    const player = template.content.firstElementChild.cloneNode(true);
     player.dataset.src = source;
     seen.replaceChildren(player);
+  }
+
+  // A clip that people disagree on, with what each of them said.
+  function compare(button) {
+    const dialog = document.querySelector(".od-both");
+    const { clipLook: clip } = button.dataset;
+    dialog.querySelector("h2").textContent = `Clip ${clip}`;
+    dialog.querySelector(".od-about").textContent = "";
+    dialog.querySelector(".od-said").replaceChildren(button.closest("li").querySelector(".od-opinions").cloneNode(true));
+    play(dialog, clip, document.querySelector(".od-given [data-clips]").dataset.clips);
   }
 
   document.addEventListener("submit", (event) => {
@@ -94,9 +127,15 @@
       .finally(() => (button.disabled = false));
   });
   document.addEventListener("change", (event) => {
+    const boxes = event.target.closest?.(".od-choose fieldset");
+    if (boxes) sayChosen(boxes);
     if (event.target.matches?.("[data-ratings] select")) load(event.target.closest(".od-given"));
   });
   document.addEventListener("click", (event) => {
+    const look = event.target.closest?.("[data-clip-look]");
+    if (look) compare(look);
+    for (const list of document.querySelectorAll(".od-choose details[open]"))
+      if (!list.contains(event.target)) list.open = false;
     if (event.target.matches?.(".od-given [data-more]")) load(event.target.closest(".od-given"), true);
   });
 

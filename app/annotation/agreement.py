@@ -6,8 +6,9 @@ alpha-reliability"): 1 is perfect, 0 is chance. Shapes: n ratings, u clips that 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -23,6 +24,15 @@ _LEAST = 20
 """Ratings, before anything is said of a rater's habits."""
 _ALIKE = 0.95
 """Share of one class from which on a rater "always says the same"."""
+GOOD, FAIR = 0.8, 0.667
+"""Alpha from which on ratings are reliable, and from which on they allow tentative conclusions: Krippendorff,
+"Content Analysis", 2004, chapter 11."""
+_PARTS = 12
+"""In which a trend is told, at most."""
+_LEAST_PART = 8
+"""Ratings in a part of a trend; clips that several people rated, for its agreement."""
+_LEAST_SHARED = 3
+"""Clips that two people rated, before they are compared."""
 _HASTY = 0.2
 """Share of answers sooner than the clip has played once from which on a rater is "too fast"."""
 
@@ -73,6 +83,49 @@ class Quality:
     warnings: list[str] = field(default_factory=list)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Trend:
+    """Figures of a rater's ratings, or of everybody's, in parts of equal length, oldest first."""
+
+    means: list[float | None]
+    """Mean rating."""
+    seconds: list[float | None]
+    """Median time from the clip on screen to the press."""
+    alphas: list[float | None]
+    """Agreement with others on the clips of the part; None where too few are shared."""
+
+
+class Disputed(NamedTuple):
+    """A clip that people rated differently."""
+
+    clip: int
+    apart: int
+    """Points between the highest and the lowest rating."""
+    opinions: list[tuple[str, int]]
+    """(rater, rating), the highest first."""
+
+
+class Difference(NamedTuple):
+    """How far two people are from each other."""
+
+    higher: str
+    """Who of the two rates higher on average."""
+    lower: str
+    clips: int
+    """That both rated."""
+    apart: float
+    """Mean absolute difference, points."""
+    above: float
+    """Mean difference, points, 0 or more."""
+
+
+def verdict(alpha: float | None) -> str:
+    """Alpha in a word: "good", "fair" or "poor"; "" if it cannot be told."""
+    if alpha is None:
+        return ""
+    return "good" if alpha >= GOOD else "fair" if alpha >= FAIR else "poor"
+
+
 def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
     dt = vector_env.spec("hopper").dt
@@ -95,7 +148,7 @@ def quality(rows: Sequence[RatingRow], *, seed: int = 0) -> Quality:
 
 
 def quality_by_rater(
-    rows: Sequence[RatingRow], *, raters: Iterable[str] = (), seed: int = 0
+    rows: Sequence[RatingRow], *, raters: Iterable[str] = (), seed: int = 0, intervals: bool = True
 ) -> dict[str, Quality]:
     """The same of each rater. Agreement is that on the clips which this rater and others have rated.
 
@@ -103,30 +156,96 @@ def quality_by_rater(
         rows: n ratings of everybody, oldest first.
         raters: More people, of whom there may be no rating.
         seed: Of the bootstrap.
+        intervals: Whether to work out those of their agreement.
     """
     answer = {}
     for rater in sorted({*raters, *(row.rater for row in rows)}):
         own = [row for row in rows if row.rater == rater]
         mine = {row.clip for row in own if not row.repeat}
-        shared = agreement([row for row in rows if row.clip in mine], seed=seed)
+        shared = agreement([row for row in rows if row.clip in mine], seed=seed, interval=intervals)
         answer[rater] = _figures(own, shared, warnings=warnings(own))
     return answer
 
 
-def agreement(rows: Sequence[RatingRow], *, seed: int = 0) -> Agreement:
-    """Krippendorff's alpha, ordinal, over the clips with two first opinions or more."""
-    counts: dict[int, np.ndarray] = {}
-    for row in rows:
-        if not row.repeat:
-            counts.setdefault(row.clip, np.zeros(_CLASSES, int))[row.value - 1] += 1
-    units = np.array([count for count in counts.values() if count.sum() > 1])
+def agreement(rows: Sequence[RatingRow], *, seed: int = 0, interval: bool = True) -> Agreement:
+    """Krippendorff's alpha, ordinal, over the clips with two first opinions or more.
+
+    Args:
+        rows: n ratings.
+        seed: Of the bootstrap.
+        interval: Whether to work it out.
+    """
+    units = np.array([count for count in _by_clip(rows).values() if count.sum() > 1])
     if not len(units):
         return Agreement()
+    if not interval:
+        return Agreement(alpha=_alpha(units), clips=len(units))
     rng = np.random.default_rng(seed)
     resampled = [_alpha(units[rng.integers(len(units), size=len(units))]) for _ in range(_RESAMPLES)]
     known = [alpha for alpha in resampled if alpha is not None]
     low, high = np.percentile(known, (2.5, 97.5)).tolist() if known else (None, None)
     return Agreement(alpha=_alpha(units), low=low, high=high, clips=len(units))
+
+
+def trends(rows: Sequence[RatingRow]) -> dict[str, Trend]:
+    """How figures went over the ratings given: "" for everybody, then each rater with enough ratings.
+
+    Args:
+        rows: n ratings of everybody, oldest first.
+    """
+    counts = _by_clip(rows)
+    names = sorted({row.rater for row in rows})
+    groups = {"": rows} | {name: [row for row in rows if row.rater == name] for name in names}
+    found = {}
+    for name, own in groups.items():
+        own = [row for row in own if not row.repeat]
+        parts = min(_PARTS, len(own) // _LEAST_PART)
+        if parts < 2:
+            continue
+        cuts = [len(own) * part // parts for part in range(parts + 1)]
+        pieces = [own[start:stop] for start, stop in pairwise(cuts)]
+        found[name] = Trend(
+            means=[float(np.mean([row.value for row in piece])) for piece in pieces],
+            seconds=[median(row.latency_ms for row in piece) / 1000 for piece in pieces],
+            alphas=[_alpha_of(counts, {row.clip for row in piece}) for piece in pieces],
+        )
+    return found
+
+
+def disputed(rows: Sequence[RatingRow], most: int = 8) -> list[Disputed]:
+    """The clips on which people are furthest apart, two points or more; of those the newest first.
+
+    Args:
+        rows: n ratings of everybody, oldest first.
+        most: How many clips.
+    """
+    found = []
+    for clip, opinions in _opinions(rows).items():
+        apart = max(opinions.values()) - min(opinions.values())
+        if apart >= 2:
+            ordered = sorted(opinions.items(), key=lambda said: (-said[1], said[0]))
+            found.append(Disputed(clip, apart, ordered))
+    return sorted(found, key=lambda one: (-one.apart, -one.clip))[:most]
+
+
+def differences(rows: Sequence[RatingRow], most: int = 6) -> list[Difference]:
+    """Which two people are furthest apart on the clips that both rated.
+
+    Args:
+        rows: n ratings of everybody.
+        most: How many pairs.
+    """
+    between: dict[tuple[str, str], list[int]] = {}
+    for opinions in _opinions(rows).values():
+        for one, other in combinations(sorted(opinions), 2):
+            between.setdefault((one, other), []).append(opinions[one] - opinions[other])
+    found = []
+    for (one, other), gaps in between.items():
+        if len(gaps) >= _LEAST_SHARED and any(gaps):
+            above = float(np.mean(gaps))
+            high, low = (one, other) if above >= 0 else (other, one)
+            found.append(Difference(high, low, len(gaps), float(np.abs(gaps).mean()), abs(above)))
+    return sorted(found, key=lambda pair: (-pair.apart, pair.higher, pair.lower))[:most]
 
 
 def warnings(rows: Sequence[RatingRow]) -> list[str]:
@@ -175,6 +294,29 @@ def _figures(rows: Sequence[RatingRow], shared: Agreement, *, warnings: list[str
 def _drift(above: Sequence[float]) -> float | None:
     third = len(above) // 3
     return float(np.mean(above[-third:]) - np.mean(above[:third])) if third >= _LEAST else None
+
+
+def _by_clip(rows: Iterable[RatingRow]) -> dict[int, np.ndarray]:
+    """How many first opinions of 1 to 5 each clip has."""
+    counts: dict[int, np.ndarray] = {}
+    for row in rows:
+        if not row.repeat:
+            counts.setdefault(row.clip, np.zeros(_CLASSES, int))[row.value - 1] += 1
+    return counts
+
+
+def _opinions(rows: Iterable[RatingRow]) -> dict[int, dict[str, int]]:
+    """First opinions, by clip and rater, of the clips that several people rated."""
+    said: dict[int, dict[str, int]] = {}
+    for row in rows:
+        if not row.repeat:
+            said.setdefault(row.clip, {})[row.rater] = row.value
+    return {clip: opinions for clip, opinions in said.items() if len(opinions) > 1}
+
+
+def _alpha_of(counts: Mapping[int, np.ndarray], clips: set[int]) -> float | None:
+    units = np.array([counts[clip] for clip in clips if counts[clip].sum() > 1])
+    return _alpha(units) if len(units) >= _LEAST_PART else None
 
 
 def _alpha(units: np.ndarray) -> float | None:

@@ -30,23 +30,18 @@ def add(
         once: A link that opens once.
         expires: A link that ends after a time: 30m, 12h, 7d.
     """
-    from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, read_span
-    from onedemo.core.names import check_new_name, check_person
+    from onedemo.app.http.invitations import invite
+    from onedemo.app.http.tokens import read_address, read_span
+    from onedemo.core.names import check_person
 
-    name = check_person(name)
-    lasts = read_span(expires) if expires is not None else None
+    name = check_person(name)  # before anything is written
+    if expires is not None:
+        read_span(expires)
+    role = "researcher" if researcher else "annotator"
     with open_store(data_dir) as store:
-        url = url or read_address(data_dir)
-        if name not in {known.name for known in store.accounts.raters()}:
-            check_new_name(name)
-        person = store.accounts.ensure(name, "researcher" if researcher else "annotator")
-        if once or lasts is not None:
-            url = passing_link(store, person, url, once=once, lasts=lasts)
-        else:
-            url = issue_link(store, read_secret(data_dir), person, url)
-        kind = ("once" if once else "standing") + (f", {expires}" if lasts else "")
-        store.audit.add(COMMAND_LINE, "made a link", f"for {person.name}, {person.role} ({kind})")
-        print(url)
+        address = url or read_address(data_dir)
+        (made,) = invite(store, [name], role, address, by=COMMAND_LINE, once=once, expires=expires)
+        print(made.url)
 
 
 @rater.command(name="list")
@@ -81,20 +76,20 @@ def revoke(name: str | None = None, /, *, link: Whole | None = None, data_dir: D
         name: The rater.
         link: Only this link, by its number.
     """
+    from onedemo.app.http import invitations
+
     if (name is None) == (link is None):
         raise UserError("name the rater whose links are to end, or one link with --link N")
     with open_store(data_dir, must_exist=True) as store:
         if link is not None:
-            ended = store.accounts.revoke_link(link)
-            store.audit.add(COMMAND_LINE, "revoked a link", f"{ended.id} of {ended.rater.name}")
+            ended = invitations.revoke_link(store, link, by=COMMAND_LINE)
             whose = f"link {ended.id} of {ended.rater.name}"
             print(f"ended {whose} and the pages opened with it; the ratings stay")
             return
         raters = {person.name: person for person in store.accounts.raters()}
         if name not in raters:
             raise UserError(f"no rater {name!r}; there are: {', '.join(raters) or 'none'}")
-        count = store.accounts.revoke_tokens(raters[name].id)
-        store.audit.add(COMMAND_LINE, "revoked a rater", name)
+        count = invitations.revoke(store, raters[name], by=COMMAND_LINE)
         print(f"ended {count} links and sessions of {name}; the ratings stay")
 
 

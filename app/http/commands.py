@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from markupsafe import Markup
+
+from onedemo.app.http import invitations
+from onedemo.app.templates import render
+from onedemo.errors import UserError
 from onedemo.storage.rating_records import MOST_REASON
 from onedemo.storage.store import Store
 from onedemo.types import Rater
@@ -19,12 +24,13 @@ class Actions:
     def __init__(self, page: Any) -> None:
         self._page = page
 
-    def do(self, who: Rater, body: Any) -> None:
-        """Does what a browser asks for: ``{"do": name, ...}``.
+    def do(self, who: Rater, body: Any, address: str = "") -> Markup | None:
+        """Does what a browser asks for: ``{"do": name, ...}``; what it answers is for whoever asked alone.
 
         Args:
             who: Asks; a researcher.
             body: As JSON gave it.
+            address: That links begin with.
 
         Raises:
             ValueError: If it is no action, or its fields are not what it takes.
@@ -37,18 +43,63 @@ class Actions:
             "new run": self._create, "pause run": self._pause, "resume run": self._resume,
             "withdraw": self._withdraw,
         }  # fmt: skip
-        if body["do"] not in actions:
-            raise ValueError(f"there is no action {body['do'][:40]!r}")
-        fields = {key: value for key, value in body.items() if key != "do"}
-        actions[body["do"]](who, fields)
-        detail = ", ".join(f"{key} {value}" for key, value in fields.items() if value != "")
-        self._store.audit.add(who.name, body["do"], f"{detail}; run {self._page.trainer.run}")
+        about_people = {"revoke": self._revoke, "revoke link": self._revoke_link}  # they write their own line
+        name, fields = body["do"], {key: value for key, value in body.items() if key != "do"}
+        if name == "invite":
+            return self._invite(who, fields, address)
+        if name in about_people:
+            about_people[name](who, fields)
+        elif name in actions:
+            actions[name](who, fields)
+            detail = ", ".join(f"{key} {value}" for key, value in fields.items() if value != "")
+            self._store.audit.add(who.name, name, f"{detail}; run {self._page.trainer.run}")
+        else:
+            raise ValueError(f"there is no action {name[:40]!r}")
+        return None
+
+    def _invite(self, who: Rater, fields: dict[str, Any], address: str) -> Markup:
+        kinds = {"role": str, "expires": str, "once": bool, "address": str}
+        names = fields.pop("names", None)
+        if not isinstance(names, str):
+            raise ValueError(f"the action takes names, {', '.join(kinds)}")
+        _check(fields, kinds, longest=200)
+        if fields["role"] not in ("annotator", "researcher"):
+            raise ValueError("people are invited as annotator or researcher")
+        if fields["address"]:
+            address = invitations.check_address(fields["address"])
+        made = invitations.invite(
+            self._store, [name for name in names.splitlines() if name.strip()], fields["role"], address,
+            by=who.name, once=fields["once"], expires=fields["expires"] or None,
+        )  # fmt: skip
+        return render(
+            "start.html:invited", invitations=made, once=fields["once"], local=invitations.local(address)
+        )
+
+    def _revoke(self, who: Rater, fields: dict[str, Any]) -> None:
+        sure = fields.pop("sure", False)
+        rater = self._rater(fields)
+        self._not_oneself(who, rater, sure)
+        invitations.revoke(self._store, rater, by=who.name)
+
+    def _revoke_link(self, who: Rater, fields: dict[str, Any]) -> None:
+        sure = fields.pop("sure", False)
+        _check(fields, {"link": int})
+        link = next((link for link in self._store.accounts.links() if link.id == fields["link"]), None)
+        if link is None:
+            raise ValueError(f"there is no link {fields['link']}")
+        self._not_oneself(who, link.rater, sure)
+        invitations.revoke_link(self._store, link.id, by=who.name)
+
+    def _not_oneself(self, who: Rater, rater: Rater, sure: Any) -> None:
+        if rater.id == who.id and sure is not True:
+            raise UserError("that would close your own page; say that you are sure")
 
     def _exclude(self, who: Rater, fields: dict[str, Any]) -> None:
-        self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id)
+        self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields).id, by=who.id)
 
     def _include(self, who: Rater, fields: dict[str, Any]) -> None:
-        self._store.ratings.leave_out(self._page.trainer.run, self._rater(fields), by=who.id, left_out=False)
+        rater = self._rater(fields).id
+        self._store.ratings.leave_out(self._page.trainer.run, rater, by=who.id, left_out=False)
 
     def _withdraw(self, who: Rater, fields: dict[str, Any]) -> None:
         _check(fields, {"rating": int, "reason": str}, longest=MOST_REASON)
@@ -81,11 +132,12 @@ class Actions:
             raise ValueError("there is this run alone")
         return self._page.study
 
-    def _rater(self, fields: dict[str, Any]) -> int:
+    def _rater(self, fields: dict[str, Any]) -> Rater:
         _check(fields, {"rater": int})
-        if fields["rater"] not in {rater.id for rater in self._store.accounts.raters()}:
+        known = {rater.id: rater for rater in self._store.accounts.raters()}
+        if fields["rater"] not in known:
             raise ValueError(f"there is no rater {fields['rater']}")
-        return fields["rater"]
+        return known[fields["rater"]]
 
 
 def _check(fields: dict[str, Any], kinds: dict[str, type], longest: int = 100) -> None:

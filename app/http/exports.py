@@ -44,7 +44,7 @@ class Downloads:
 
     async def csv(self, request: web.Request) -> web.StreamResponse:
         """The ratings."""
-        rows = self._store.ratings.stream(**read_filters(request.query))
+        rows = self._store.ratings.stream(**self._filters(request))
         return await self._stream(request, "ratings", csv_writer.csv_blocks(rows))
 
     async def comparisons(self, request: web.Request) -> web.StreamResponse:
@@ -121,7 +121,7 @@ class Downloads:
 
     async def preview(self, request: web.Request) -> web.StreamResponse:
         """A look at the ratings."""
-        filters = read_filters(request.query)
+        filters = self._filters(request)
         html = await asyncio.to_thread(self._table, filters)
         return web.Response(text=html, content_type="text/html")
 
@@ -135,10 +135,23 @@ class Downloads:
             raise web.HTTPBadRequest(text="Ratings are listed by run, rater and number.")
         ratings, number = self._store.ratings, min(int(before), 2**53) if before else None
         most = _SHOWN + 1
-        found = await asyncio.to_thread(ratings.given, run, rater=rater or None, before=number, most=most)
+        (rater,) = self._spelled([rater]) if rater else [None]
+        found = await asyncio.to_thread(ratings.given, run, rater=rater, before=number, most=most)
         raters = sorted({name for name, _ in await asyncio.to_thread(ratings.tallies, run)})
         rows = [rating._asdict() for rating in found[:_SHOWN]]
         return web.json_response({"ratings": rows, "more": len(found) > _SHOWN, "raters": raters})
+
+    def _filters(self, request: web.Request) -> dict[str, Any]:
+        filters = read_filters(request.query)
+        if "rater" in filters:
+            filters["rater"] = self._spelled(filters["rater"])
+        return filters
+
+    def _spelled(self, names: list[str]) -> list[str]:
+        """These names as their raters write them; what is nobody's name stays as it is."""
+        known = {rater.name for rater in self._store.accounts.raters()}
+        alike = {name.casefold(): name for name in known}
+        return [name if name in known else alike.get(name.casefold(), name) for name in names]
 
     def _table(self, filters: dict[str, Any]) -> str:
         rows = self._store.ratings.stream(**filters)
@@ -157,7 +170,7 @@ class Downloads:
 
 
 def read_filters(query) -> dict[str, Any]:
-    """The filters in a query; empty ones are none.
+    """The filters in a query; empty ones are none. Of raters there may be several, as a list.
 
     Raises:
         web.HTTPBadRequest: If one is unknown, or no number where one is wanted.
@@ -166,6 +179,8 @@ def read_filters(query) -> dict[str, Any]:
     for name, value in query.items():
         if name not in FILTERS or len(value) > 200 or (name in _NUMBERS and not _NUMBER.fullmatch(value)):
             raise web.HTTPBadRequest(text=f"Ratings cannot be filtered by {name[:40]!r} {value[:40]!r}.")
-        if value:
+        if value and name == "rater":
+            filters.setdefault(name, []).append(value)
+        elif value:
             filters[name] = int(value) if name in _NUMBERS else value
     return filters

@@ -25,6 +25,7 @@ from onedemo.app.http import assets
 from onedemo.app.http.auth import SECURITY_HEADERS, AccessControl, Route
 from onedemo.app.http.commands import Actions
 from onedemo.app.http.exports import Downloads
+from onedemo.app.http.invitations import page_address
 from onedemo.app.http.media import Files, Filmed
 from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
@@ -317,10 +318,12 @@ class Front:
             if not free:
                 raise web.HTTPServiceUnavailable(text="Other changes are still being made: please wait.")
             try:
-                await self._in_turn(self._acting, self._actions.do, request[RATER], await read_json(request))
+                body = await read_json(request)
+                address = page_address(self._listening, self._port, request.headers["Origin"])
+                told = await self._in_turn(self._acting, self._actions.do, request[RATER], body, address)
             except (ValueError, UserError) as error:
                 raise web.HTTPBadRequest(text=f"This could not be done: {error}.") from None
-        return web.Response(status=204)
+        return web.Response(status=204) if told is None else web.Response(text=told, content_type="text/html")
 
     async def _in_turn(self, threads: ThreadPoolExecutor, work: Callable[..., Any], *values: Any) -> Any:
         return await self._loop.run_in_executor(threads, partial(work, *values))

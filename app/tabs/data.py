@@ -5,12 +5,26 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from urllib.parse import quote
 
 from markupsafe import Markup
 
-from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
+from onedemo.app.annotation.agreement import (
+    FAIR,
+    GOOD,
+    Difference,
+    Disputed,
+    Quality,
+    Trend,
+    differences,
+    disputed,
+    quality,
+    quality_by_rater,
+    rating_rows,
+    trends,
+    verdict,
+)
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
@@ -70,8 +84,9 @@ class Data:
             names = {rater.id: name for name, rater in people.items()}
             given = {names[who]: c for who, c in store.ratings.counts(run).items() if c != Counts()}
             figures = data_html(
-                run, method, store.ratings.tallies(run), quality(rows), quality_by_rater(rows, raters=given),
-                given, people, store.ratings.left_out(run),
+                run, method, store.ratings.tallies(run), quality(rows),
+                quality_by_rater(rows, raters=given, intervals=False), given, people,
+                store.ratings.left_out(run), trends(rows), disputed(rows), differences(rows),
             )  # fmt: skip
             self._html.content = str(figures)
             self._counted, self._counted_at = event, time.monotonic()
@@ -84,6 +99,7 @@ class Data:
 def data_html(
     run: str, method: str, counts: Mapping[tuple[str, str], list[int]], whole: Quality,
     each: Mapping[str, Quality], given: Mapping[str, Counts], people: Mapping[str, Rater], left_out: set[int],
+    over_time: Mapping[str, Trend], clips: Sequence[Disputed], pairs: Sequence[Difference],
 ) -> Markup:  # fmt: skip
     """The tab's figures.
 
@@ -96,11 +112,46 @@ def data_html(
         given: How many ratings each has given, by name.
         people: Raters by name.
         left_out: Raters whose ratings nothing learns from.
+        over_time: Trends, as ``agreement.trends``.
+        clips: On which people disagree.
+        pairs: Who disagree.
     """
     return render(
         "data.html:ratings", run=run, method=method, tallies=counts, whole=whole, each=each, given=given,
-        people=people, left_out=left_out, answers=ANSWERS, counts=sum(given.values(), Counts()),
+        people=people, left_out=left_out, answers=ANSWERS, verdict=verdict, good=GOOD, fair=FAIR,
+        trends=[(name, _curves(trend)) for name, trend in over_time.items()], disputed=clips, pairs=pairs,
+        counts=sum(given.values(), Counts()),
     )  # fmt: skip
+
+
+def _curves(trend: Trend) -> list[tuple[str, list[float | None], list[list[tuple[float, float]]]]]:
+    """Of each figure of a trend: how it is written, its values, and its line in parts."""
+    slowest = max(10.0, *(value for value in trend.seconds if value is not None))
+    return [
+        (form, values, line(values, low, high))
+        for form, values, low, high in (
+            (".1f", trend.means, 1.0, 5.0), (".1f", trend.seconds, 0.0, slowest),
+            (".2f", trend.alphas, 0.0, 1.0),
+        )
+    ]  # fmt: skip
+
+
+def line(values: Sequence[float | None], low: float, high: float) -> list[list[tuple[float, float]]]:
+    """A small chart's line: points in percent from the top left, in parts where values are missing.
+
+    Args:
+        values: In order, at equal distances.
+        low: Value at the bottom; what is less is drawn there.
+        high: Value at the top.
+    """
+    parts: list[list[tuple[float, float]]] = [[]]
+    for index, value in enumerate(values):
+        if value is None:
+            parts.append([])
+            continue
+        share = min(1.0, max(0.0, (value - low) / (high - low)))
+        parts[-1].append((round(100 * index / max(1, len(values) - 1), 1), round(100 * (1 - share), 1)))
+    return [part for part in parts if part]
 
 
 def export_html(run: str, path: str, clips: str, fps: float) -> Markup:

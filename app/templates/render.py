@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+
+_ZERO = re.compile(r"[+-]0(\.0+)?")
 
 
 @cache
@@ -46,8 +49,11 @@ def render(template: str, /, **values: Any) -> Markup:
 
 
 def number(value: float | None, form: str = "") -> str:
-    """Filter: a number as ``format`` writes it; a dash where there is none."""
-    return "–" if value is None else format(value, form)
+    """Filter: a number as ``format`` writes it; a dash where there is none, and no sign before a zero."""
+    if value is None:
+        return "–"
+    text = format(value, form)
+    return text[1:] if _ZERO.fullmatch(text) else text
 
 
 def steps(count: int) -> str:

@@ -25,7 +25,7 @@ from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEA
 from onedemo.app.services.demo_images import Pictures, version_of
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study
-from onedemo.app.tabs import data, guide, rate, runs, watch
+from onedemo.app.tabs import data, guide, rate, runs, start, watch
 from onedemo.app.tabs.compare import Compare
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.ui.session import Session, TabMaker
@@ -199,7 +199,7 @@ class Page:
 
 
 def tabs_of(role: str, *, compare: bool = False) -> list[TabMaker]:
-    """The tabs a role gets, in order; the first one is shown first."""
+    """The tabs a role gets, in order."""
     if role == "researcher":
-        return [watch.Watch, runs.Runs, rate.Rate, Compare, data.Data, guide.Guide]
+        return [start.Start, watch.Watch, runs.Runs, rate.Rate, Compare, data.Data, guide.Guide]
     return [rate.Rate, *([Compare] if compare else []), guide.Guide]

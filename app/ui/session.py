@@ -60,7 +60,13 @@ class Session:
             )
             self._shown = 0
             self.refresh(context.training.status())
-            self.choose(0)
+            self.choose(self._first())
+
+    def _first(self) -> int:
+        """The tab that is shown first: of a researcher's page Watch, once there is an iteration."""
+        titles, context = [tab.title for tab in self._tabs], self._context
+        practised = context.store.runs.last_iteration(context.run) is not None
+        return titles.index("Watch") if practised and "Start" in titles else 0
 
     def choose(self, index: int) -> None:
         """Shows the tab of that index and hides the others."""

@@ -51,6 +51,7 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
     )  # fmt: skip
     with opened(chromium, site.links["researcher"], viewport, color_scheme=scheme) as page:
         for tab, content in (
+            ("Start", ".od-people tr"),
             ("Watch", ".od-gallery img"),
             ("Runs", ".od-runs"),
             ("Compare", ".od-pair [data-frame]"),
@@ -60,6 +61,10 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
         ):
             page.click(f'.od-tabs >> text="{tab}"')
             page.wait_for_selector(content, timeout=60_000)
+            if tab == "Start":
+                page.fill("[name=names]", "Ann\nBob")
+                page.click("text=Make links")
+                page.wait_for_selector(".od-links svg", state="attached")
             assert_nothing_serious(page, tab)
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("s"))

@@ -468,6 +468,8 @@ def test_what_researchers_do_is_in_the_log(site):
                 await (await session.get(f"{site.url}/{path}")).read()
         async with browser_session() as session:
             tab = await open_tab(session, site.links["researcher"])
+            await tab.until(lambda: "alt+2" in tab.keys, "the tab Watch")
+            await tab.press("alt+2")
             await tab.until(lambda: "alt+P" in tab.keys, "keys")
             for rater in (2, 99):
                 await tab.do(do="exclude", rater=rater)

@@ -88,6 +88,7 @@ def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
     assert rows(data_dir) == expected
     until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 60)
     with opened(chromium, links["researcher"], TINY) as page:
+        page.click('.od-tabs >> text="Watch"')
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
         where = page.locator("canvas[data-engine]").bounding_box()
         seen: set[bytes] = set()  # empty, drawn, and moving

@@ -320,6 +320,7 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
 
 def test_researcher_sees_the_robot_move(chromium, site):
     with opened(chromium, site.links["researcher"], SMALL) as page:
+        page.click('.od-tabs >> text="Watch"')
         canvas = page.locator("canvas[data-engine]")
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
         page.wait_for_selector(".od-time >> text=/Video at [0-9.]+ s of 8.0 s/")

@@ -84,6 +84,8 @@ async def default_run(data_dir: Path, *, quick: bool) -> list[Result]:
     with serving(data_dir, [f"ratings.pretrain={pretrain}"] if quick else []) as server:
         async with browser_session() as session:
             watch = await open_tab(session, server.links["researcher"])
+            await watch.until(lambda: "alt+2" in watch.keys, "the tab Watch")
+            await watch.press("alt+2")
             rate = await open_tab(session, server.links["annotator"])
             await give(rate, pretrain)
             await reach(lambda: _iterations(server) >= 1, "an iteration")

@@ -203,6 +203,8 @@ async def bring(session: ClientSession, server: Server, phase: str) -> None:
     if await asyncio.to_thread(server.phase) == phase:
         return
     page = await open_tab(session, server.links["researcher"])
+    await page.until(lambda: "alt+2" in page.keys, "the tab Watch")
+    await page.press("alt+2")
     await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
     await page.press("alt+P")
     await reach(lambda: server.phase() == phase, f"the phase {phase}")

@@ -49,7 +49,7 @@ def test_roles_get_their_tabs():
     assert [tab.title for tab in app.tabs_of("annotator")] == ["Rate", "Guide"]
     assert [tab.title for tab in app.tabs_of("annotator", compare=True)] == ["Rate", "Compare", "Guide"]
     titles = [tab.title for tab in app.tabs_of("researcher")]
-    assert titles == ["Watch", "Runs", "Rate", "Compare", "Data", "Guide"]
+    assert titles == ["Start", "Watch", "Runs", "Rate", "Compare", "Data", "Guide"]
 
 
 def test_only_known_messages_are_let_in():

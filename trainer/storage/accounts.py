@@ -6,10 +6,11 @@ Only hashes of tokens are kept: who reads the database cannot come in with what 
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from onedemo.errors import UserError
 from onedemo.storage.database import Database, now
@@ -41,6 +42,15 @@ class Link:
     created_at: str
     expires_at: str | None
     last_used_at: str | None
+
+
+class Presence(NamedTuple):
+    """Whether somebody is about."""
+
+    browsers: int
+    """Sessions that hold."""
+    last_seen: str | None
+    """When a page of theirs was last open, or they last answered; None: never."""
 
 
 _LINK = f"t.id, p.id, p.name, p.role, t.once, {_STATE}, t.created_at, t.expires_at, t.last_used_at"
@@ -178,6 +188,23 @@ class Accounts:
         That is kept in memory alone: pages come back within seconds of a restart.
         """
         self._used |= dict.fromkeys(session_hashes, now())
+
+    def presence(self) -> dict[int, Presence]:
+        """How many sessions each rater has, and when they were last seen, by the rater's number."""
+        sessions = self._database.rows(
+            f"SELECT t.rater_id, t.hash, t.last_used_at, {_STATE} = 'open' FROM tokens t"
+            " WHERE t.kind = 'session'",
+            {"now": now()},
+        )
+        answers = self._database.rows(
+            "SELECT id, (SELECT created_at FROM events WHERE rater_id = raters.id ORDER BY id DESC LIMIT 1)"
+            " FROM raters"
+        )
+        browsers, seen = Counter[int](), {rater: at or "" for rater, at in answers}
+        for rater, session, used, holds in sessions:
+            browsers[rater] += holds
+            seen[rater] = max(seen[rater], used or "", self._used.get(session, ""))
+        return {rater: Presence(browsers[rater], at or None) for rater, at in seen.items()}
 
     def link_of_session(self, session_hash: str) -> int | None:
         """The number of the link by which a session that holds came, if that is known."""

@@ -308,22 +308,27 @@ class Ratings:
             counts.setdefault((name, stage), [0] * 5)[value - 1] = ratings
         return counts
 
-    def stream(self, run: str | None = None, **only: str | int | None) -> Iterator[tuple]:
+    def stream(self, run: str | None = None, **only: str | int | Sequence[str] | None) -> Iterator[tuple]:
         """Rows of the view ``ratings`` in order of their number, streamed.
 
         Args:
             run: Of this run alone.
-            only: Of these values of other columns alone, such as ``rater="Ann"``; None: of any.
+            only: Of these values of other columns alone, such as ``rater="Ann"`` or, of any of these,
+                ``rater=["Ann", "Bob"]``; None: of any.
         """
         only = {"run": run, **only}
         unknown = set(only) - set(RATING_COLUMNS)
         if unknown:
             raise ValueError(f"ratings have no column {min(unknown)!r}")
-        chosen = {name: value for name, value in only.items() if value is not None}
-        where = " AND ".join(f"{name} = ?" for name in chosen) or "1"
+        chosen = {
+            name: [value] if isinstance(value, str | int) else list(value)
+            for name, value in only.items()
+            if value is not None
+        }
+        where = [f"{name} IN ({', '.join('?' * len(values))})" for name, values in chosen.items()]
         return self._database.stream(
-            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE {where} ORDER BY id",
-            tuple(chosen.values()),
+            f"SELECT {', '.join(RATING_COLUMNS)} FROM ratings WHERE {' AND '.join(where) or '1'} ORDER BY id",
+            tuple(value for values in chosen.values() for value in values),
         )
 
     def stream_skips(self, run: str | None = None) -> Iterator[tuple]:

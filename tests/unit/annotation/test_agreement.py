@@ -4,7 +4,17 @@ import krippendorff
 import numpy as np
 import pytest
 
-from onedemo.app.annotation.agreement import RatingRow, agreement, quality, quality_by_rater, warnings
+from onedemo.app.annotation.agreement import (
+    RatingRow,
+    agreement,
+    differences,
+    disputed,
+    quality,
+    quality_by_rater,
+    trends,
+    verdict,
+    warnings,
+)
 
 
 def row(clip, rater="Ann", value=3, *, repeat=False, latency_ms=2000, predicted=None):
@@ -79,3 +89,40 @@ def test_each_rater_is_compared_on_the_clips_that_others_rated_too():
 )
 def test_who_should_be_looked_at(rows, warned):
     assert warnings(rows) == warned
+
+
+def test_agreement_has_a_verdict_in_a_word():
+    said = [verdict(alpha) for alpha in (None, -0.2, 0.66, 0.667, 0.79, 0.8, 1.0)]
+    assert said == ["", "poor", "poor", "fair", "fair", "good", "good"]
+
+
+def test_figures_of_raters_need_no_interval():
+    rows = [row(clip, rater, clip % 5 + 1) for clip in range(20) for rater in ("Ann", "Bob")]
+    (ann, _) = quality_by_rater(rows, intervals=False).values()
+    assert ann.agreement.alpha == pytest.approx(1.0) and ann.agreement.low is None
+
+
+def test_who_disagrees_and_on_which_clips():
+    rows = [row(clip, "Ann", 5 if clip < 4 else 3) for clip in range(8)]
+    rows += [row(clip, "Bob", 2 if clip < 4 else 3) for clip in range(8)]
+    rows += [row(clip, "Cy", 4) for clip in range(2)] + [row(7, "Ann", 1, repeat=True)]
+    clips = disputed(rows, most=3)
+    assert [(one.clip, one.apart) for one in clips] == [(3, 3), (2, 3), (1, 3)]
+    assert clips[2].opinions == [("Ann", 5), ("Cy", 4), ("Bob", 2)]
+    assert disputed([row(1, "Ann", 3), row(1, "Bob", 4)]) == []  # a point apart is no dispute
+    (pair,) = differences(rows)  # Cy shares two clips with the others: too few
+    assert (pair.higher, pair.lower, pair.clips) == ("Ann", "Bob", 8)
+    assert pair.apart == pytest.approx(1.5) and pair.above == pytest.approx(1.5)
+    assert differences([row(c, r, 3) for c in range(5) for r in ("Ann", "Bob")]) == []
+
+
+def test_trends_tell_how_figures_went():
+    rows = [row(c, "Ann", 2 if c < 40 else 4, latency_ms=3000 if c < 40 else 1000) for c in range(80)]
+    rows += [row(c, "Bob", 1 + c % 2, latency_ms=2000) for c in range(16)]
+    found = trends(rows)
+    assert list(found) == ["", "Ann", "Bob"]
+    assert len(found["Ann"].means) == 10 and len(found["Bob"].means) == 2
+    assert (found["Ann"].means[0], found["Ann"].means[-1]) == (2.0, 4.0)
+    assert (found["Ann"].seconds[0], found["Ann"].seconds[-1]) == (3.0, 1.0)
+    assert found["Ann"].alphas[-1] is None and found["Bob"].alphas[0] is not None
+    assert trends([row(c, "Ann") for c in range(15)]) == {}

@@ -59,4 +59,6 @@ def test_a_template_compiles_and_trusts_nobody(name):
 def test_filters(filter, values):
     for value, text in values:
         assert environment().filters[filter](value) == text
-    assert environment().filters["number"](1234.56, ",.1f") == "1,234.6"
+    written = environment().filters["number"]
+    assert written(1234.56, ",.1f") == "1,234.6"
+    assert [written(value, "+.1f") for value in (-0.04, 0.04, -0.06)] == ["0.0", "0.0", "-0.1"]
