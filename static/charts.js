@@ -78,7 +78,7 @@ const charts = (() => {
     const size = Math.abs(value);
     if (size >= 1e6) return `${+(value / 1e6).toPrecision(4)} M`;
     if (size >= 1e4) return `${+(value / 1e3).toPrecision(4)} k`;
-    return `${+value.toPrecision(3)}`;
+    return `${+value.toPrecision(size < 1 ? 2 : 3)}`;
   }
 
   const told = (value) => (value == null ? "–" : Math.abs(value) >= 1000 ? Math.round(value).toLocaleString("en") : short(value));
@@ -153,8 +153,8 @@ const charts = (() => {
     get extent() {
       if (this.zoom) return this.zoom;
       const all = this.feeds.flatMap((feed) => [feed.columns[this.x][0], feed.columns[this.x].at(-1)]);
-      const [low, high] = [Math.min(...all), Math.max(...all)];
-      return [low, Math.max(high, low + 1)];
+      const low = Math.min(...all);
+      return [low === 1 ? 0 : low, Math.max(...all, low + 1)];
     }
 
     show(zoom) {
@@ -261,7 +261,7 @@ const charts = (() => {
         padding: [14, 18, 0, 0],
         legend: { show: false },
         scales: { x: { time: false, range: () => group.extent }, y: { range: (u, low, high) => this.#range(low, high) } },
-        axes: [{ ...axis, size: 26, space: 64, incrs: WHOLE }, { ...axis, size: 46, space: 34 }],
+        axes: [{ ...axis, size: 26, space: 48, incrs: WHOLE }, { ...axis, size: 46, space: 34 }],
         series: [
           {},
           ...this.#lines.map(({ stroke, dash, faint, level }) => ({
@@ -368,7 +368,10 @@ const charts = (() => {
       ctx.lineWidth = ratio;
       ctx.font = `${11 * ratio}px system-ui, sans-serif`;
       ctx.textAlign = "center";
+      let [before, beside] = [null, 0];
       for (const { x, sign } of this.#marks()) {
+        beside = x === before ? beside + 1 : 0; // what came at once stands in a row
+        before = x;
         const at = Math.round(u.valToPos(x, "x", true)) + 0.5;
         if (!inside(at)) continue;
         ctx.setLineDash([2 * ratio, 3 * ratio]);
@@ -376,7 +379,7 @@ const charts = (() => {
         ctx.moveTo(at, bbox.top);
         ctx.lineTo(at, bbox.top + bbox.height);
         ctx.stroke();
-        ctx.fillText(sign, at, bbox.top - 3 * ratio);
+        ctx.fillText(sign, at + 11 * beside * ratio, bbox.top - 3 * ratio);
       }
       if (this.group.x === "number" && this.group.feeds.length === 1) {
         const { number, snapshot } = this.group.feeds[0].columns;

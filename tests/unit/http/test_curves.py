@@ -69,9 +69,8 @@ def test_what_is_asked_wrongly_is_said(trainer):
 def test_a_vendored_file_is_served_and_nothing_beside_it(trainer):
     found = ask(
         trainer, "/static/vendor/uplot/uPlot.iife.min.js", "/static/vendor/uplot/LICENSE",
-        "/static/vendor/uplot/../page.css", "/static/vendor/../page.css", "/static/vendor/none/page.css",
-        "/static/vendor/%2e%2e/page.css", "/static/vendor/uplot/%2e%2e%2fpage.css",
+        "/static/vendor/uplot/none.js", "/static/vendor/none/page.css",
+        "/static/vendor/uplot/..%2f..%2fpage.css",
     )  # fmt: skip
-    assert [status for status, _ in found][:2] == [200, 404]
+    assert [status for status, _ in found] == [200, 404, 404, 404, 404]
     assert "uPlot" in found[0][1]
-    assert {status for status, _ in found[4:]} == {404}
