@@ -1,4 +1,4 @@
-// Buttons and forms of a researcher: films, actions on a run, the filter of the Data tab, uploads.
+// Buttons and forms of a researcher: actions on a run, the filter of the Data tab, uploads.
 (() => {
   "use strict";
   const { act, named } = page; // static/page.js
@@ -7,14 +7,7 @@
     const button = event.target instanceof Element ? event.target.closest("button") : null;
     if (!button || button.disabled) return;
     const data = button.dataset;
-    if (data.video) {
-      const film = document.querySelector(".od-film");
-      const video = film.querySelector("video");
-      video.src = data.video;
-      film.showModal();
-      video.play().catch(() => {});
-      film.addEventListener("close", () => video.pause(), { once: true });
-    } else if (data.do) {
+    if (data.do) {
       button.disabled = true; // until the page is drawn anew
       const { do: action, ...fields } = data;
       if (fields.rater) fields.rater = Number(fields.rater);

@@ -70,8 +70,19 @@ class Files:
 
     async def static(self, request: web.Request) -> web.StreamResponse:
         """A file of ours."""
-        path = assets.STATIC / request.match_info["name"]
-        if path.parent != assets.STATIC or path.suffix not in assets.SERVED or not path.is_file():
+        return self._served(assets.STATIC, request)
+
+    async def vendored(self, request: web.Request) -> web.StreamResponse:
+        """A file of a package of others that the page uses, named in ``static/vendor``."""
+        names = {folder.name: folder for folder in (assets.STATIC / "vendor").iterdir()}
+        folder = names.get(request.match_info["package"])
+        if folder is None:
+            raise web.HTTPNotFound()
+        return self._served(folder, request)
+
+    def _served(self, folder: Path, request: web.Request) -> web.StreamResponse:
+        path = folder / request.match_info["name"]
+        if path.parent != folder or path.suffix not in assets.SERVED or not path.is_file():
             raise web.HTTPNotFound()
         return web.FileResponse(path, headers={"Cache-Control": "no-cache"})
 

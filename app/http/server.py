@@ -24,6 +24,7 @@ from onedemo.app.annotation.rating_session import AnsweredElsewhere
 from onedemo.app.http import assets
 from onedemo.app.http.auth import SECURITY_HEADERS, AccessControl, Route
 from onedemo.app.http.commands import Actions
+from onedemo.app.http.curves import Curves
 from onedemo.app.http.exports import Downloads
 from onedemo.app.http.invitations import page_address
 from onedemo.app.http.media import Files, Filmed
@@ -118,6 +119,7 @@ class Front:
         self._tls = listening.ssl_context()
         self._actions = Actions(page)
         self._files = Files(page)
+        self._curves = Curves(page)
         self._downloads = Downloads(store, SECURITY_HEADERS)
         self._uploads = Uploads(store.path.parent)
         self._access = AccessControl(store, listening, lambda: self._port, page.is_open)
@@ -149,11 +151,13 @@ class Front:
         # The page asks for these below its person; programs may leave the person out.
         either = (
             Route("GET", "/static/{name}", "annotator", files.static),
+            Route("GET", "/static/vendor/{package}/{name}", "annotator", files.vendored),
             Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
             Route("GET", r"/pairs/{pair:\d{1,15}}.jpg", "annotator", files.pair),
             Route("GET", r"/demo/frames/{index:\d{1,6}}.jpg", "annotator", files.demo_frame),
             Route("GET", r"/demo/examples/{name:[a-z]{1,20}}.jpg", "annotator", files.demo_example),
             Route("GET", r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", "researcher", files.rollout),
+            Route("GET", "/curves.json", "researcher", self._curves.curves),
             Route("GET", "/export.csv", "researcher", downloads.csv, "downloaded ratings"),
             Route("GET", "/comparisons.csv", "researcher", downloads.comparisons, "downloaded comparisons"),
             Route("GET", "/skips.csv", "researcher", downloads.skips, "downloaded skips"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -33,6 +34,10 @@ class Training(Protocol):
 
     def stop(self, timeout_s: float = 60.0) -> None:
         """Ends it after the iteration in hand; waits for that so long."""
+        ...
+
+    def rollout_picture(self, iteration: int, suffix: str) -> Future[Path]:
+        """The best rollout of an iteration as "jpg" or "webm", once it is drawn."""
         ...
 
     def want_pairs(self) -> None:

@@ -1,26 +1,20 @@
-"""How far the robot is: which parts of the demo it is good at, and its best rollouts so far. HTML, pure."""
+"""How far the robot is: which parts of the demo it is good at. HTML, pure."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 from markupsafe import Markup
 
 from onedemo.app.templates import render
 
-_SHOWN = 12
-"""Iterations in the gallery."""
 
-
-def timeline_html(rows: Sequence[dict], seconds: float) -> Markup:
-    """Predicted rating along the demo, of the newest iteration that has one.
+def timeline_html(row: dict | None, seconds: float) -> Markup:
+    """Predicted rating along the demo.
 
     Args:
-        rows: Iterations, oldest first.
+        row: The newest iteration; None before the first.
         seconds: Length of the demo.
     """
-    row = next((row for row in reversed(rows) if row.get("timeline")), None)
-    if row is None:
+    if row is None or not row.get("timeline"):
         return render("watch.html:no_timeline")
     parts = row["timeline"]
     known = [part for part in parts if part is not None]
@@ -40,23 +34,3 @@ def timeline_html(rows: Sequence[dict], seconds: float) -> Markup:
         "watch.html:timeline", iteration=row["number"], cells=cells, told=told, missing=None in parts,
         seconds=seconds,
     )  # fmt: skip
-
-
-def chosen(numbers: Sequence[int], most: int = _SHOWN) -> list[int]:
-    """Iterations to be shown: the newest first, then ever older ones, spread evenly."""
-    if len(numbers) <= most:
-        return list(reversed(numbers))
-    last = len(numbers) - 1
-    return [numbers[round(last * (most - 1 - k) / (most - 1))] for k in range(most)]
-
-
-def gallery_html(rows: Sequence[dict], version: str) -> Markup:
-    """The best rollout of some iterations: a filmstrip each, which opens as a video.
-
-    Args:
-        rows: Iterations, oldest first.
-        version: Of the run's pictures, as ``pictures.version_of``.
-    """
-    best = {row["number"]: row["best"] for row in rows if row.get("best") is not None}
-    cards = [(number, best[number]) for number in chosen(list(best))]
-    return render("watch.html:gallery", cards=cards, version=version)

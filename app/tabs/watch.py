@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
+from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from onedemo.app.services.live_rollout import Moment
 from onedemo.app.tabs import charts, progress
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
+from onedemo.errors import UserError
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
 
@@ -46,6 +49,9 @@ class Watch:
         self._scene: ViserMujocoScene | None = None
         self._frame = -1
         self._practised = False
+        self._newest = 0
+        self._filmed: int | None = None
+        self._film: Future[Path] | None = None
         self._confirm_until = 0.0
         self._commands: list[Any] = []
         self._shown = False
@@ -55,12 +61,12 @@ class Watch:
         gui.add_html(str(render("watch.html:robot")))
         self._picture = gui.add_html("")
         self._time = gui.add_html("")
-        self._parts = gui.add_html(str(progress.timeline_html([], self._demo.seconds)))
+        gui.add_html(str(render("watch.html:reset")))
         frames = [frame_address(n, self._demo.sha256) for n in range(self._demo.frames)]
         gui.add_html(str(render("watch.html:preload", sources=frames)))
-        self._charts = charts.Charts(gui, has_reward=bool(self._demo.task), dark=context.dark)
-        self._classes = gui.add_html("")
-        self._gallery = gui.add_html("")
+        gui.add_html(str(charts.run_html(self._run, has_reward=bool(self._demo.task))))
+        self._below = gui.add_html("")
+        gui.add_html(str(render("watch.html:gallery", run=self._run, version=self._version)))
         gui.add_html(str(render("watch.html:film")))
         self._put(self._picture, frame_html(0, self._demo.sha256))
         self._put(self._time, time_html(0, 0, self._demo.seconds, ""))
@@ -74,6 +80,7 @@ class Watch:
             self._live.watch(self._client.client_id, self._draw)
             self._key("Pause or resume training", "P", self._toggle)
             self._key("Stop training", "X", self._stop)
+            self._key("Reset the view of the robot", "R", self._look)
             self.refresh(self._training.status())
 
     def hide(self) -> None:
@@ -98,12 +105,26 @@ class Watch:
                 counts=counts, confirming=time.monotonic() < self._confirm_until,
             )  # fmt: skip
             self._put(self._strip, strip)
-            self._put(self._classes, render("parts.html:classes", counts=counts.classes, answers=ANSWERS))
-            new = store.runs.iterations(run, after=self._charts.last)
-            self._charts.extend(new)
-            if new:
-                self._put(self._parts, progress.timeline_html(self._charts.rows, self._demo.seconds))
-                self._put(self._gallery, progress.gallery_html(self._charts.rows, self._version))
+            newest = store.runs.last_iteration(run)
+            self._film_ahead(newest)
+            below = render(
+                "watch.html:below", counts=counts,
+                timeline=progress.timeline_html(newest, self._demo.seconds),
+                classes=render("parts.html:classes", counts=counts.classes, answers=ANSWERS),
+            )  # fmt: skip
+            self._put(self._below, below)
+
+    def _film_ahead(self, newest: dict | None) -> None:
+        """Has the film of the best rollout made while somebody watches, before they ask for it."""
+        if newest is None or newest["number"] == self._newest or (self._film and not self._film.done()):
+            return
+        self._newest = newest["number"]
+        best = self._store.runs.best_iteration(self._run)
+        if best is None or best == self._filmed:
+            return
+        self._filmed = best
+        with suppress(FileNotFoundError, UserError):  # what cannot be drawn is said to whoever presses
+            self._film = self._training.rollout_picture(best, "webm")
 
     def close(self) -> None:
         """Leaves the live robot."""
@@ -161,12 +182,17 @@ class Watch:
             shadow_opacity=0.22,
             plane_opacity=0.0,
         )
-        camera = self._client.camera
-        camera.up_direction = (0.0, 0.0, 1.0)
-        camera.position = _CAMERA_POSITION
-        camera.look_at = _CAMERA_TARGET
-        camera.fov = math.radians(_CAMERA_FOV)
         self._scene = scene
+        self._look()
+
+    def _look(self) -> None:
+        """Looks at the robot as the demonstration does."""
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.position = _CAMERA_POSITION
+            camera.look_at = _CAMERA_TARGET
+            camera.fov = math.radians(_CAMERA_FOV)
 
     def _draw(self, moment: Moment) -> None:
         scene = self._scene

@@ -144,11 +144,11 @@ def test_parts_of_the_demo_and_the_best_rollouts(chromium, site):
         page.wait_for_selector(".od-gallery >> text=predicted rating 2.8")
         page.locator(".od-gallery button").first.scroll_into_view_if_needed()
         page.wait_for_function("() => document.querySelector('.od-gallery img').naturalWidth > 0")
-        page.click("[data-video]")
+        page.click("[data-film]")
         page.wait_for_function("() => document.querySelector('.od-film video').currentTime > 0.1")
         page.keyboard.press("Escape")
         with page.expect_download() as given:
-            page.click("text=Download video")
+            page.click("text=Download")
         assert given.value.suggested_filename == "onedemo-iteration-3.webm"
 
 

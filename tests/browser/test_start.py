@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from browser.test_page import DESKTOP, PHONE, opened, press_and_wait, shown_clip, until
+from browser.test_page import DESKTOP, PHONE, opened, press_and_wait, shown_clip
 
 pytestmark = pytest.mark.seam
 

@@ -101,7 +101,9 @@ def outcome(data_dir: Path) -> dict:
         }
         found: dict[str, Any] = {name: [list(row) for row in db.execute(sql)] for name, sql in rows.items()}
         curve = db.execute("SELECT number, snapshot, env_steps, stats FROM iterations ORDER BY number")
-        found["curve"] = [[*row, {**json.loads(stats), "steps_per_s": 0}] for *row, stats in curve]
+        found["curve"] = [
+            [*row, {**json.loads(stats), "steps_per_s": 0, "seconds": 0}] for *row, stats in curve
+        ]
     found["segments"] = [
         [clip, hashlib.sha256(data.encode()).hexdigest()] for clip, data in found["segments"]
     ]

@@ -48,5 +48,5 @@ class TrainingSet:
         )
         return RatedSegment(
             event=rating.event, demo_step=rating.demo_step, segment=segment, value=rating.value,
-            mark=rating.mark,
+            mark=rating.mark, clip=rating.clip,
         )  # fmt: skip

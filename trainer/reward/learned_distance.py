@@ -31,7 +31,7 @@ import torch
 from torch.nn import functional
 
 from onedemo.reward.latent_track import track_of
-from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View
+from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View, expected
 from onedemo.reward.segment_marks import marked_steps
 from onedemo.sim import kinematics
 from onedemo.storage.rating_records import RatedSegment
@@ -89,11 +89,19 @@ class MetricSnapshot(Snapshot):
         else:
             members = zip(self._tracks, self._weights, strict=True)
             squares = np.stack([np.square(track[frames] - robot) @ w for track, w in members], axis=-1)
-        distance = np.sqrt(squares + _TINY)
+        return self._chances(np.sqrt(squares + _TINY))
+
+    def _chances(self, distance: np.ndarray) -> np.ndarray:
+        """Probability of each rating at distances by each member, (..., M) to (M, ..., 5), float32."""
         above = self.steepness[:, None] * (self.thresholds - distance[..., None])
         above = 1 / (1 + np.exp(-np.clip(above, -30, 30)))  # (..., M, 4): P(y >= 5), ... P(y >= 2)
         whole = np.concatenate([np.zeros_like(above[..., :1]), above, np.ones_like(above[..., :1])], -1)
         return np.moveaxis(np.diff(whole, axis=-1)[..., ::-1], -2, 0).astype(np.float32)
+
+    def best(self) -> float:
+        """As ``Snapshot.best``: the rating at distance zero."""
+        nothing = np.full(len(self.steepness), np.sqrt(_TINY), self._weights.dtype)
+        return float(expected(self._chances(nothing)).mean())
 
     def beside(self, view: View) -> MetricSnapshot | None:
         """As ``Snapshot.beside``; an imagined track cannot be known before the first rating."""

@@ -100,6 +100,10 @@ class Snapshot(ABC):
             (members, ..., 5), float32, for ratings 1 to 5.
         """
 
+    def best(self) -> float | None:
+        """The rating of a robot that does exactly what the demo shows; None where the kind does not know."""
+        return None
+
     def beside(self, view: View) -> Snapshot | None:
         """The same predictor beside another demo, as snapshot 0: what is known before the first rating.
 

@@ -61,6 +61,8 @@ class RatedSegment:
     value: int
     mark: tuple[int, int] | None = None
     """Where it goes wrong: first step, step after the last."""
+    clip: int = 0
+    """Its number; 0 where it has none."""
 
 
 class LastAnswer(NamedTuple):

@@ -72,6 +72,55 @@ class Runs:
         )
         return [{"number": n, "last_event": e, "ratings": r, **json.loads(stats)} for n, e, r, stats in rows]
 
+    def mark(self, run: str, iteration: int, kind: str) -> None:
+        """Notes that a run was held or went on.
+
+        Args:
+            run: Its name.
+            iteration: The last one before it.
+            kind: "paused", "resumed", "stopped" or "failed".
+        """
+        with self._database.transaction() as db:
+            db.execute(
+                "INSERT INTO run_marks (run, iteration, kind, created_at) VALUES (?, ?, ?, ?)",
+                (run, iteration, kind, now()),
+            )
+
+    def marks(self, run: str) -> list[tuple[int, str, str]]:
+        """What happened to a run besides its iterations: (last iteration before it, kind, rater).
+
+        Returns:
+            By iteration: what ``mark`` noted, with no rater, and who was excluded from training ("excluded")
+            or taken in again ("included").
+        """
+        return self._database.rows(
+            "SELECT iteration, kind, '' FROM run_marks WHERE run = ?1 UNION ALL"
+            " SELECT (SELECT COALESCE(MAX(i.number), 0) FROM iterations i"
+            "  WHERE i.run = ?1 AND i.created_at <= e.created_at),"
+            " CASE e.kind WHEN 'leave out' THEN 'excluded' ELSE 'included' END, p.name"
+            " FROM events e JOIN raters p ON p.id = e.rater_id WHERE e.clip_id IS NULL AND e.run = ?1"
+            " ORDER BY 1",
+            (run,),
+        )
+
+    def forecasts(self, run: str) -> list[tuple[str, int, float]]:
+        """What was predicted for clips before anybody had rated them, and the first rating of each.
+
+        Returns:
+            (time, rating, predicted rating), in the order of the ratings.
+        """
+        return self._database.rows(
+            "SELECT e.created_at, e.value, e.predicted FROM events e JOIN clips c ON c.id = e.clip_id"
+            " WHERE c.run = ? AND e.kind = 'rate' AND e.repeat = 0 AND e.predicted IS NOT NULL"
+            " AND NOT EXISTS (SELECT 1 FROM events l"
+            "  WHERE l.clip_id = e.clip_id AND l.kind = 'rate' AND l.id < e.id) ORDER BY e.id",
+            (run,),
+        )
+
+    def numbers(self) -> dict[str, int]:
+        """A number of each run that no other has, 1 and up, in the order in which they were made."""
+        return dict(self._database.rows("SELECT id, rowid FROM runs ORDER BY rowid"))
+
     def add_iteration(self, run: str, number: int, *, snapshot: int, env_steps: int, stats: dict) -> None:
         """Records an iteration whose checkpoint is on disk already."""
         with self._database.transaction() as db:
@@ -82,12 +131,28 @@ class Runs:
 
     def iterations(self, run: str, after: int = 0) -> list[dict]:
         """Iterations of a run beyond number ``after``: {number, snapshot, env_steps, **stats}."""
+        return [row for _, row in self.dated_iterations(run, after)]
+
+    def dated_iterations(self, run: str, after: int = 0) -> list[tuple[str, dict]]:
+        """The same, each with when it was recorded."""
         rows = self._database.rows(
-            "SELECT number, snapshot, env_steps, stats FROM iterations"
+            "SELECT created_at, number, snapshot, env_steps, stats FROM iterations"
             " WHERE run = ? AND number > ? ORDER BY number",
             (run, after),
         )
-        return [{"number": n, "snapshot": s, "env_steps": e, **json.loads(stats)} for n, s, e, stats in rows]
+        return [
+            (at, {"number": n, "snapshot": s, "env_steps": e, **json.loads(stats)})
+            for at, n, s, e, stats in rows
+        ]
+
+    def best_iteration(self, run: str) -> int | None:
+        """Number of the iteration whose best rollout is the best of all; None if none has one."""
+        rows = self._database.rows(
+            "SELECT number FROM iterations WHERE run = ? AND json_extract(stats, '$.best') IS NOT NULL"
+            " ORDER BY json_extract(stats, '$.best') DESC, number LIMIT 1",
+            (run,),
+        )
+        return rows[0][0] if rows else None
 
     def last_iteration(self, run: str) -> dict | None:
         """The newest iteration of a run, as ``iterations``; None if there is none."""

@@ -266,6 +266,17 @@ STEPS: dict[int, str] = {
     7: """
     ALTER TABLE events ADD COLUMN withdrawn TEXT CHECK (withdrawn IS NULL OR kind = 'undo');
     """,
+    # 8: when a run was held and went on, for the charts.
+    8: """
+    CREATE TABLE run_marks (
+        id INTEGER PRIMARY KEY AUTOINCREMENT,
+        run TEXT NOT NULL REFERENCES runs (id) ON DELETE CASCADE,
+        iteration INTEGER NOT NULL,     -- the last one before it
+        kind TEXT NOT NULL CHECK (kind IN ('paused', 'resumed', 'stopped', 'failed')),
+        created_at TEXT NOT NULL
+    );
+    CREATE INDEX run_marks_by_run ON run_marks (run, id);
+    """,
 }
 
 

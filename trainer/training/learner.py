@@ -8,6 +8,7 @@ Shapes: N lanes, T control steps, F demo frames, D frame features, W control ste
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -20,7 +21,17 @@ from onedemo.errors import UserError
 from onedemo.queries.selection import Question, choose
 from onedemo.reward.episode_rules import PracticeRules, ResetBuffer, fill_reset_buffer, mean_rating
 from onedemo.reward.latent_track import track_basis
-from onedemo.reward.model import FitStats, Lens, Snapshot, View, check_start, fit, fit_lens, visual_inputs
+from onedemo.reward.model import (
+    FitStats,
+    Lens,
+    Snapshot,
+    View,
+    check_start,
+    expected,
+    fit,
+    fit_lens,
+    visual_inputs,
+)
 from onedemo.rl.policy import Policy, PolicySnapshot, check_device
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
@@ -39,6 +50,8 @@ _JUDGED_EVERY = 4
 """Control steps between those that are looked at to choose a clip."""
 _TABLE_DIMS = 2 * kinematics.POSE
 """Numbers of each of them: pose and motion where they are known, else principal components."""
+_LOOKED_AT = 500
+"""States of an iteration about which the members are asked."""
 _DEVICE_LANES = 1024
 """From so many lanes on an accelerator acts itself; with fewer the way there and back costs more."""
 
@@ -65,6 +78,8 @@ class Learner:
         self.demo_steps, self.clip_steps = lengths(config, frames, fps)
         self.iteration = 0
         self.env_steps = 0
+        self.seconds: dict[str, float] = {}
+        """What parts of the last iteration took."""
         self._view: View | None = None
         self._start = start
         self._first: Snapshot | None = None  # the start beside this demo
@@ -192,6 +207,7 @@ class Learner:
         Returns:
             The rollouts, and figures: ``predicted`` (mean rating, 1..5) and those of ``TrpoStats``.
         """
+        began = time.perf_counter()
         sizes = self.config.rollouts
         left = -(-(sizes.total_steps - self.env_steps) // sizes.lanes)
         steps = max(1, min(sizes.steps, left))
@@ -199,10 +215,52 @@ class Learner:
         self._use(snapshot)
         rollouts = self._collector.collect(policy, steps)
         predicted = mean_rating(rollouts.rewards.ravel(), (rollouts.next_clock - rollouts.clock).ravel())
+        collected = time.perf_counter()
         stats = self._trpo.update(rollouts, progress=min(1.0, self.env_steps / sizes.total_steps))
+        self.seconds = {"rollouts": collected - began, "policy": time.perf_counter() - collected}
         self.iteration += 1
         self.env_steps += rollouts.clock.size
         return rollouts, {"predicted": float(predicted), **asdict(stats)}
+
+    def forecast(self, snapshot: Snapshot, ratings: Sequence[RatedSegment]) -> dict[str, float]:
+        """How right a snapshot is about ratings that it was not fitted on; draws nothing at random.
+
+        Args:
+            snapshot: Fitted before they were given.
+            ratings: n of them.
+
+        Returns:
+            Sums over them: ``new`` (n), ``hits`` (the most probable rating is the one given) and
+            ``confidence`` (its probability). Nothing if n is 0.
+        """
+        if not ratings:
+            return {}
+        steps = np.array([r.demo_step for r in ratings])[:, None] + np.arange(self.clip_steps)
+        obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
+        chances = snapshot.probabilities(self.frames_of(steps), obs, actions).mean(axis=1)
+        hits = chances.argmax(axis=-1) + 1 == np.array([r.value for r in ratings])
+        return {
+            "new": len(ratings), "hits": int(hits.sum()), "confidence": float(chances.max(axis=-1).sum()),
+        }  # fmt: skip
+
+    def diagnose(self, rollouts: Transitions, snapshot: Snapshot) -> dict[str, float | None]:
+        """Figures of an iteration that nothing learns from, and that draw nothing at random.
+
+        Returns:
+            ``disagreement``, the members' standard deviation of the rating of a state, its mean over some
+            states; ``episode_seconds``, the mean length of an episode, None if none ended; ``reference``, the
+            rating of a robot that does what the demo shows, None where it is not known.
+        """
+        stride = max(1, rollouts.clock.size // _LOOKED_AT)
+        obs, actions = (x.reshape(-1, x.shape[-1])[::stride] for x in (rollouts.next_obs, rollouts.actions))
+        frames = self.frames_of(rollouts.next_clock.ravel()[::stride])
+        members = expected(snapshot.member_probabilities(frames, obs, actions))
+        ended = int((rollouts.terminated | rollouts.truncated).sum())
+        return {
+            "disagreement": float(members.std(axis=0).mean()),
+            "episode_seconds": rollouts.clock.size * self.dt / ended if ended else None,
+            "reference": snapshot.best(),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Everything a resumed run needs besides config, demo and ratings, for ``torch.save``."""

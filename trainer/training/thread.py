@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from onedemo.core.cpu import give_way
 from onedemo.errors import in_words
 from onedemo.training.training_run import TrainingRun
-from onedemo.types import Status
+from onedemo.types import HALTED, Status
 
 log = logging.getLogger("onedemo")
 
@@ -253,10 +253,21 @@ class Trainer:
     def _went_well(self) -> None:
         self._rest_s = self._first_rest_s
         if self._error:
-            self._error, self._phase = "", self._next_phase
+            self._error = ""
+            self._enter(self._next_phase)
 
     def _tell(self, phase: str) -> None:
         if self._error and phase not in ("failed", "stopped"):
             self._next_phase = phase  # what failed is tried again, and has not gone well yet
         else:
-            self._phase = phase
+            self._enter(phase)
+
+    def _enter(self, phase: str) -> None:
+        before, self._phase = self._phase, phase
+        going = phase == "online" and self._training.iteration > 0
+        if phase == before or not (going or phase in HALTED):
+            return
+        try:
+            self._training.mark("resumed" if going else phase)
+        except Exception:  # the charts lack it; the phase is what counts
+            log.debug("run %s: %s could not be noted", self.run, phase, exc_info=True)

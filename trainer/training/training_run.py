@@ -11,7 +11,7 @@ No thread and no waiting is in here: ``simulated_run.train`` calls ``step`` unti
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
@@ -30,6 +30,7 @@ from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
 from onedemo.sim import vector_env
 from onedemo.sim.task_rewards import TASK_REWARDS
+from onedemo.storage.rating_records import RatedSegment
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.best_rollouts import Gallery
@@ -131,6 +132,8 @@ class TrainingRun:
         self._tidy_at = 0.0
         self._training_set = TrainingSet(store, run)
         self._fitted_event = 0
+        self._fitted_clips: set[int] = set()
+        """Those that the newest snapshots were fitted on."""
         self._pool: Rollouts | None = None
         self._policy: PolicySnapshot | None = None
 
@@ -250,12 +253,14 @@ class TrainingRun:
         if not ratings:
             return False
         number = (self.snapshot.number if self.snapshot else 0) + 1
+        forecast = self._forecast(ratings)
         snapshot, stats = self._opened.fit(ratings, number)
         snapshot.save(self.files.snapshot(number))
         self.store.runs.add_snapshot(
-            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats)
+            self.run, number, last_event=event, ratings=len(ratings), stats=asdict(stats) | forecast
         )
         self.snapshot, self._fitted_event = snapshot, event
+        self._fitted_clips |= {rating.clip for rating in ratings}
         self.queue.predict_waiting(self._opened, snapshot)
         return True
 
@@ -263,15 +268,19 @@ class TrainingRun:
         """One iteration with the newest ratings, and all that is kept of it."""
         began = time.monotonic()
         self.refit()
+        refitted = time.monotonic()
         learner, snapshot = self._opened, self.snapshot
         assert snapshot is not None, "the policy is trained on a snapshot"
         before = learner.env_steps
         rollouts, stats = learner.iterate(snapshot)
-        stats |= self._true_reward(rollouts)
+        stats |= self._true_reward(rollouts) | learner.diagnose(rollouts, snapshot)
         if self._drawn is not None:
             gallery = self._drawn.rollouts
             stats |= gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
-        stats["steps_per_s"] = (learner.env_steps - before) / (time.monotonic() - began)
+        took = time.monotonic() - began
+        seconds = {"refit": refitted - began, **learner.seconds}
+        stats["seconds"] = seconds | {"other": max(0.0, took - sum(seconds.values()))}
+        stats["steps_per_s"] = (learner.env_steps - before) / took
         self._pool, self._policy = rollouts, learner.policy()
         row = {"snapshot": snapshot.number, "env_steps": learner.env_steps, "stats": stats}
         left = self.queue.given() < self.queue.target
@@ -284,6 +293,10 @@ class TrainingRun:
             self._watch(learner, snapshot)
 
     # What other threads may call
+
+    def mark(self, kind: str) -> None:
+        """Notes for the charts that the run was held or went on, as ``Runs.mark``."""
+        self.store.runs.mark(self.run, self.iteration, kind)
 
     def acting(self) -> Acting | None:
         """The newest policy beside the demo as the newest snapshot moves it; None until there is a policy.
@@ -333,6 +346,13 @@ class TrainingRun:
         assert self.learner is not None, "open() comes first"
         return self.learner
 
+    def _forecast(self, ratings: Sequence[RatedSegment]) -> dict[str, float]:
+        """How right the newest snapshot is about clips that it was not fitted on, as ``Learner.forecast``."""
+        if self.snapshot is None:
+            return {}
+        new = [r for r in ratings if r.event > self._fitted_event and r.clip not in self._fitted_clips]
+        return self._opened.forecast(self.snapshot, new)
+
     def _true_reward(self, rollouts: Transitions) -> dict[str, float]:
         """The hand-coded reward where the demo's task has one: shown, never used for training."""
         if self.demo.task not in TASK_REWARDS:
@@ -349,6 +369,8 @@ class TrainingRun:
             if read_whole(file) is not None:
                 self.snapshot = Snapshot.load(file, self.config.device)
                 self._fitted_event = row["last_event"]
+                fitted = self.store.ratings.for_training(self.run, self._fitted_event)
+                self._fitted_clips = {rating.clip for rating in fitted}
                 return
 
     def _load_checkpoint(self, learner: Learner) -> bool:

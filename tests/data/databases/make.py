@@ -72,6 +72,11 @@ def make(version: int, file: Path) -> None:
             " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
         put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
         put("INSERT INTO audit (at, who, what, detail) VALUES (?, 'ada', 'came in', 'link 1')", (AT,))
+        if version >= 8:
+            put(
+                "INSERT INTO run_marks (run, iteration, kind, created_at) VALUES ('hop-1', 1, 'paused', ?)",
+                (AT,),
+            )
         put("VACUUM")
 
 

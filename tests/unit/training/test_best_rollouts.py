@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.small_world import falling_demo, falling_states
-from onedemo.app.tabs.progress import chosen, gallery_html, timeline_html
+from onedemo.app.tabs.progress import timeline_html
 from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.rollouts import Transitions
@@ -92,19 +92,8 @@ def test_the_best_rollout_is_drawn_when_asked_for_and_once(tmp_path):
 
 
 def test_the_strip_names_the_weakest_part_and_what_was_not_reached():
-    rows = [{"number": 1, "timeline": [1.0, 3.0, 2.0, None]}, {"number": 2}]
-    html = timeline_html(rows, 8.0)
+    html = timeline_html({"number": 1, "timeline": [1.0, 3.0, 2.0, None]}, 8.0)
     assert "iteration 1; between 1.0 and 3.0; weakest at 1.0 s; 2.0 s not reached (dashed)" in html
     assert html.count("<i style=") == 3 and "6.0 to 8.0 s: not reached" in html and "--od-rated:50%" in html
-    assert "no part was reached" in timeline_html([{"number": 1, "timeline": [None]}], 8.0)
-    assert "iteration" not in timeline_html([], 8.0)
-
-
-def test_the_gallery_shows_the_newest_and_some_of_all_before():
-    assert chosen([1, 2, 3]) == [3, 2, 1]
-    shown = chosen(list(range(1, 626)))
-    assert len(shown) == 12 and shown[0] == 625 and shown[-1] == 1 and shown == sorted(shown, reverse=True)
-    rows = [{"number": k, "best": 2.0 + k / 10} for k in range(1, 4)]
-    html = gallery_html(rows, "r")
-    assert html.index("Iteration 3") < html.index("Iteration 1") and "predicted rating 2.3" in html
-    assert gallery_html([{"number": 1}], "r") == ""
+    assert "no part was reached" in timeline_html({"number": 1, "timeline": [None]}, 8.0)
+    assert "iteration" not in timeline_html(None, 8.0)

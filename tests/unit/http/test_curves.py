@@ -1,0 +1,76 @@
+"""Curves over HTTP: for researchers alone, of any run, and what is asked wrongly."""
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+from aiohttp import CookieJar
+from aiohttp.test_utils import TestClient, TestServer
+
+from helpers.curves import train
+from helpers.fake_trainer import StandIn
+from onedemo.app.http.server import Front
+from onedemo.app.http.tokens import issue_link, read_secret
+from onedemo.app.network.bind import Listening
+
+
+@pytest.fixture
+def trainer(tmp_path):
+    trainer = StandIn(tmp_path, clips=1)
+    yield trainer
+    trainer.store.close()
+
+
+def ask(trainer, *paths, role="researcher"):
+    """Status and text of each path, below the person and without."""
+    page = SimpleNamespace(
+        trainer=trainer, pictures=None, study=None, port=0, secret="", is_open=lambda *_: False
+    )
+    front = Front(page, Listening(port=0))
+
+    async def visit():
+        async with TestServer(front._access.application(front.routes())) as server:
+            async with TestClient(server, cookie_jar=CookieJar(unsafe=True)) as client:
+                if role:
+                    rater = trainer.store.accounts.ensure("somebody", role)
+                    link = issue_link(trainer.store, read_secret(trainer.data_dir), rater, "")
+                    await client.get(link)
+                answers = [await client.get(path) for path in paths]
+                return [(answer.status, await answer.text()) for answer in answers]
+
+    return asyncio.run(visit())
+
+
+@pytest.mark.parametrize(("role", "status"), [("", 401), ("annotator", 403), ("researcher", 200)])
+def test_only_researchers_get_curves(trainer, role, status):
+    ((got, text),) = ask(trainer, f"/curves.json?run={trainer.run}", role=role)
+    assert got == status and ("columns" in text) == (status == 200)
+
+
+def test_any_run_is_told_of_with_its_own_colour(trainer):
+    import json
+
+    trainer.store.runs.add(run="hop-1", demo="hop", demo_sha256="1", seed=1, config="", version="0")
+    train(trainer.store, "hop-1", 1, 4)
+    (_, here), (_, there), (_, later) = ask(
+        trainer, f"/curves.json?run={trainer.run}", "/curves.json?run=hop-1", "/curves.json?run=hop-1&after=3"
+    )
+    here, there, later = map(json.loads, (here, there, later))
+    assert (here["colour"], here["live"], there["colour"], there["live"]) == (1, True, 2, False)
+    assert there["columns"]["number"] == [1, 2, 3, 4] and later["columns"]["number"] == [4]
+
+
+def test_what_is_asked_wrongly_is_said(trainer):
+    wrong = ("", "?run=", "?run=a&after=x", "?run=a&after=-1", f"?run={'a' * 201}", f"?run=a&after={10**12}")
+    assert [status for status, _ in ask(trainer, *(f"/curves.json{query}" for query in wrong))] == [400] * 6
+    assert ask(trainer, "/curves.json?run=nothing") == [(404, "There is no such run.")]
+
+
+def test_a_vendored_file_is_served_and_nothing_beside_it(trainer):
+    found = ask(
+        trainer, "/static/vendor/uplot/uPlot.iife.min.js", "/static/vendor/uplot/LICENSE",
+        "/static/vendor/uplot/none.js", "/static/vendor/none/page.css",
+        "/static/vendor/uplot/..%2f..%2fpage.css",
+    )  # fmt: skip
+    assert [status for status, _ in found] == [200, 404, 404, 404, 404]
+    assert "uPlot" in found[0][1]
