@@ -266,6 +266,11 @@ STEPS: dict[int, str] = {
     7: """
     ALTER TABLE events ADD COLUMN withdrawn TEXT CHECK (withdrawn IS NULL OR kind = 'undo');
     """,
+    # 9: what people call a run and say of it; its name (id) stays, as that of its directory and in exports.
+    9: """
+    ALTER TABLE runs ADD COLUMN title TEXT NOT NULL DEFAULT '';
+    ALTER TABLE runs ADD COLUMN note TEXT NOT NULL DEFAULT '';
+    """,
 }
 
 
