@@ -1,7 +1,8 @@
-// Buttons and forms of a researcher: actions on a run, the filter of the Data tab, uploads.
+// Buttons and forms of a researcher: runs and demos, the filter of the Data tab. New videos are in
+// static/demos.js; films in static/watch.js.
 (() => {
   "use strict";
-  const { act, named } = page; // static/page.js
+  const { act } = page; // static/page.js
 
   document.addEventListener("click", (event) => {
     const button = event.target instanceof Element ? event.target.closest("button") : null;
@@ -9,23 +10,133 @@
     const data = button.dataset;
     if (data.do) {
       button.disabled = true; // until the page is drawn anew
-      const { do: action, ...fields } = data;
+      const { do: action, said, ...fields } = data;
       if (fields.rater) fields.rater = Number(fields.rater);
-      act(action, fields).catch((error) => {
-        button.disabled = false;
-        button.textContent = error.message;
-      });
+      if (action === "open run") tell("One moment: the run at hand finishes its iteration first.");
+      line.during(act(action, fields)).then(
+        () => said && tell(said),
+        (error) => {
+          button.disabled = false;
+          if (action === "open run") tell(plain(error.message));
+          else button.textContent = error.message;
+        },
+      );
     } else if (data.compare) compare(data.compare);
+    else if ("compareNone" in data) compareOnly([""]);
+    else if ("compareUsual" in data) compareOnly([]);
+    else if (data.editRun) editRun(data);
+    else if (data.editDemo) editDemo(data);
+    else if (data.jump) document.getElementById(data.jump)?.scrollIntoView({ block: "start" });
+    else if ("close" in data) button.closest("dialog").close();
   });
 
-  // A run on or off the charts: what is written in the field says which are there.
+  // A word on what was done, at the bottom edge; it outlives what Viser draws.
+  let gone = 0;
+  function tell(text) {
+    let note = document.querySelector("body > .od-told");
+    if (!note) {
+      note = document.createElement("p");
+      note.className = "od-told";
+      note.setAttribute("role", "status");
+      document.body.append(note);
+    }
+    note.textContent = text;
+    clearTimeout(gone);
+    gone = setTimeout(() => note.remove(), 12000);
+  }
+
+  const plain = (text) => {
+    const said = text.replace(/^This could not be done: /, "");
+    return said.charAt(0).toUpperCase() + said.slice(1);
+  };
+
+  // Which runs are compared: their names, in a field that Viser sends on and nobody sees; "," is none.
+  function compareOnly(runs) {
+    const field = document.querySelector("div:has(> .od-runs) + div input");
+    const value = runs.length === 1 && !runs[0] ? "," : runs.join(", ");
+    // React sees a change only through the element's own setter.
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, value);
+    field.dispatchEvent(new Event("input", { bubbles: true }));
+  }
   function compare(run) {
-    const field = document.querySelector("div:has(> .od-runs) ~ div input");
     const on = [...document.querySelectorAll('[data-compare][aria-pressed="true"]')].map((b) => b.dataset.compare);
     const runs = on.includes(run) ? on.filter((name) => name !== run) : [...on, run];
-    // React sees a change only through the element's own setter.
-    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, runs.join(", "));
-    field.dispatchEvent(new Event("input", { bubbles: true }));
+    compareOnly(runs.length ? runs : [""]);
+  }
+
+  // Dialogs of their own, outside what Viser draws anew.
+  function dialogOf(template, name) {
+    const dialog = document.getElementById(template).content.firstElementChild.cloneNode(true);
+    dialog.querySelector("[data-name]").textContent = name;
+    dialog.addEventListener("close", () => dialog.remove());
+    document.body.append(dialog);
+    dialog.showModal();
+    return dialog;
+  }
+
+  // What a dialog's button does: the dialog closes, or says why it cannot be.
+  function doing(dialog, action, fields, said) {
+    const note = dialog.querySelector(".od-form-note");
+    act(action, fields).then(
+      () => (dialog.close(), tell(said)),
+      (error) => (note.textContent = plain(error.message)),
+    );
+  }
+
+  // A button that asks once more before it deletes something.
+  function asking(button, text, again, done) {
+    button.textContent = text;
+    button.addEventListener("click", () => {
+      if ("sure" in button.dataset) return done();
+      button.dataset.sure = "";
+      button.textContent = again;
+    });
+    button.addEventListener("blur", () => {
+      delete button.dataset.sure;
+      button.textContent = text;
+    });
+  }
+
+  const count = (number, one) => `${Number(number).toLocaleString("en")} ${one}${Number(number) === 1 ? "" : "s"}`;
+
+  function editRun({ editRun: run, title, note, ratings, comparisons, here }) {
+    const dialog = dialogOf("od-edit-run", run);
+    const form = dialog.querySelector("form");
+    [form.elements.title.value, form.elements.note.value] = [title, note];
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      const fields = { run, title: form.elements.title.value, note: form.elements.note.value };
+      doing(dialog, "describe run", fields, "Saved.");
+    });
+    dialog.querySelector("[data-free]").hidden = Boolean(here);
+    dialog.querySelector("[data-kept]").hidden = !here;
+    const people = [Number(ratings) && count(ratings, "rating"), Number(comparisons) && count(comparisons, "comparison")].filter(Boolean);
+    const what = people.length ? ` with ${people.join(" and ")} that people gave` : "";
+    dialog.querySelector("[data-what]").textContent =
+      `The run ${run} goes${what}, with its clips, reward models, films and policy.`;
+    const save = dialog.querySelector("[data-export]");
+    save.href = `export.zip?run=${encodeURIComponent(run)}`;
+    save.hidden = !people.length;
+    const button = dialog.querySelector("[data-delete]");
+    const gone = people.length ? `Delete the run and its ${people.join(" and ")}` : "Delete the run";
+    asking(button, gone, "Press again to delete it for good", () =>
+      doing(dialog, "delete run", { run }, `The run ${run} is deleted.`));
+  }
+
+  function editDemo({ editDemo: demo, runs }) {
+    const dialog = dialogOf("od-edit-demo", demo);
+    const form = dialog.querySelector("form");
+    form.elements.name.value = demo;
+    form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      const name = form.elements.name.value.trim();
+      doing(dialog, "rename demo", { demo, name }, `${demo} is called ${name} now.`);
+    });
+    const used = Number(runs) > 0;
+    dialog.querySelector("[data-free]").hidden = used;
+    dialog.querySelector("[data-kept]").hidden = !used;
+    asking(dialog.querySelector("[data-delete]"), "Remove it", "Press again to remove it for good", () =>
+      doing(dialog, "remove demo", { demo }, `${demo} is removed.`));
   }
 
   // The Data tab's filter: the preview, and the same choice for the download.
@@ -47,50 +158,58 @@
       place.replaceChildren(...new DOMParser().parseFromString(text, "text/html").body.childNodes);
     });
   });
-  // A form that is an action.
+  // A form that is an action. What is wrong is said in one sentence at the field that it is about.
   document.addEventListener("submit", (event) => {
     const form = event.target.closest?.("[data-act]");
     if (!form) return;
     event.preventDefault();
-    const place = form.parentElement.querySelector(".od-form-note");
+    const inputs = [...form.elements].filter((input) => input.name);
+    for (const input of inputs) wrong(input, "");
+    const bad = inputs.filter((input) => !input.checkValidity());
+    for (const input of bad) wrong(input, input.dataset.wrong ?? input.validationMessage);
+    if (bad.length) return bad[0].focus();
+    const place = (form.closest("section") ?? form.parentElement).querySelector(".od-form-note");
     const fields = Object.fromEntries(new FormData(form));
-    for (const input of form.querySelectorAll("[type=number]")) fields[input.name] = Number(input.value);
-    place.textContent = "One moment: the current run finishes its iteration first.";
-    act(form.dataset.act, fields).catch((error) => (place.textContent = error.message));
-  });
-  // A video on its way: fetch tells nothing of how far it is, hence the older request.
-  document.addEventListener("submit", (event) => {
-    const form = event.target.closest?.("[data-upload]");
-    if (!form) return;
-    event.preventDefault();
-    const place = form.parentElement.querySelector(".od-form-note");
-    const button = form.querySelector("button");
-    const done = (text) => {
-      place.textContent = text;
-      button.disabled = false;
-    };
-    const request = new XMLHttpRequest();
-    request.upload.onprogress = ({ loaded, total }) => {
-      const share = Math.floor((100 * loaded) / total);
-      place.textContent = share < 100 ? `Uploading: ${share} %` : "Upload complete; the video is being checked.";
-    };
-    request.onload = () => {
-      if (request.status !== 200) return done(request.responseText);
-      const choice = document.querySelector(".od-new-run select[name=demo]");
-      const name = request.getResponseHeader("X-Demo");
-      if (choice && ![...choice.options].some((option) => option.value === name)) choice.add(new Option(name));
-      if (choice) choice.value = name;
-      form.reset();
-      done(request.responseText);
-    };
-    request.onerror = () => done("The connection was lost during the upload. Please try again.");
-    request.open("POST", form.dataset.upload);
-    for (const [name, value] of Object.entries(named())) request.setRequestHeader(name, value);
+    for (const { name, value } of form.querySelectorAll("[type=number]")) fields[name] = value === "" ? null : Number(value);
+    const button = form.querySelector("button:not([type=button])");
     button.disabled = true;
-    place.textContent = "Uploading";
-    request.send(new FormData(form));
-    line.during(new Promise((over) => (request.onloadend = over)));
+    place.textContent = "One moment: the current run finishes its iteration first.";
+    line.during(act(form.dataset.act, fields)).then(
+      () => {
+        place.textContent = "";
+        if (form.dataset.done) tell(form.dataset.done);
+      },
+      (error) => {
+        const said = error.message;
+        const about = inputs.find(({ name, dataset }) =>
+          name.includes(".") ? said.includes(name) : dataset.says && new RegExp(`: (a )?${dataset.says}|\\b${dataset.says}\\b`).test(said));
+        place.textContent = about ? "" : plain(said);
+        if (!about) return;
+        wrong(about, plain(said.replace(about.name, about.dataset.label ?? about.name)));
+        about.focus();
+      },
+    ).finally(() => (button.disabled = false));
   });
+
+  // The sentence at a field; none if it is empty.
+  function wrong(input, text) {
+    const field = input.closest(".od-field");
+    if (!field) return;
+    let note = field.querySelector(".od-wrong");
+    if (!text) {
+      note?.remove();
+      input.removeAttribute("aria-invalid");
+      return;
+    }
+    if (!note) {
+      note = document.createElement("small");
+      note.className = "od-wrong";
+      note.setAttribute("role", "alert");
+      input.after(note);
+    }
+    note.textContent = text;
+    input.setAttribute("aria-invalid", "true");
+  }
   document.addEventListener("input", (event) => {
     const form = event.target.closest?.("[data-filter]");
     if (!form) return;

@@ -127,9 +127,7 @@ const line = (() => {
   }
 
   function reload() {
-    if (busy) return;
-    sessionStorage.setItem("onedemo-tab", document.querySelector(".od-tabs [aria-current]")?.dataset.key ?? "");
-    location.reload();
+    if (!busy) location.reload();
   }
 
   // What is shown
@@ -178,13 +176,6 @@ const line = (() => {
     show(made, title);
   }
 
-  // The tab that was open when the page was loaded anew by itself.
-  function takeTab() {
-    const tab = sessionStorage.getItem("onedemo-tab");
-    sessionStorage.removeItem("onedemo-tab");
-    return tab;
-  }
-
   // Keeps the page from being loaded anew until something is done.
   async function during(promise) {
     busy += 1;
@@ -201,5 +192,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, ended, request, settings, takeTab, unanswered };
+  return { Closed, answers, during, ended, request, settings, unanswered };
 })();

@@ -14,10 +14,6 @@ const page = (() => {
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
-  // Viser writes its server into the address bar when the page has a path; here that is always ours.
-  const replaceState = history.replaceState.bind(history);
-  history.replaceState = (state, title) => replaceState(state, title, location.pathname);
-
   const shown = (selector) => document.querySelector(selector);
 
   function typing(target) {
@@ -89,7 +85,7 @@ const page = (() => {
   const NOT_YET = "Not saved yet: the server does not answer. Your answer is kept here and sent again.";
 
   // Presses without an answer, oldest first. They outlive a reload of the page.
-  const PRESSES = `onedemo-presses-${location.pathname}`;
+  const PRESSES = `onedemo-presses-${new URL(".", location.href).pathname}`; // of the person, whatever the tab
   const kept = {
     read: () => JSON.parse(sessionStorage.getItem(PRESSES) ?? "[]"),
     write: (bodies) => sessionStorage.setItem(PRESSES, JSON.stringify(bodies)),
@@ -341,12 +337,9 @@ const page = (() => {
 
   watchPlayers();
 
-  // After a reload: what was on its way, and the tab that was open.
-  const tab = line.takeTab();
-  seen(pageName, 60000).then(async () => {
+  // After a reload: what was on its way.
+  seen(pageName, 60000).then(() => {
     for (const body of kept.read()) enqueue(body);
-    const there = () => shown(`.od-tabs [data-key="${CSS.escape(tab)}"][aria-current]`);
-    for (let tries = 0; tab && tries < 3 && !(await seen(there, 500)); tries += 1) viserKey(tab);
   });
 
   // Viser connects only with WebGL. Without it, say so instead of showing an empty page.
@@ -369,5 +362,5 @@ const page = (() => {
     document.body.append(note);
   });
 
-  return { act, named };
+  return { act, named, viserKey };
 })();

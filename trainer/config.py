@@ -83,7 +83,7 @@ class RunConfig:
     """Everything that decides a run, besides the ratings."""
 
     method: str = "onedemo"
-    """"onedemo", or "paper": the settings of Gandhi et al. 2019 (``METHODS``)."""
+    """"onedemo", or "paper": the settings of Gandhi et al. 2019."""
     seed: int = 0
     """Of every random number in the run."""
     env: str = "hopper"

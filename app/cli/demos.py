@@ -84,13 +84,10 @@ def rename(old: str, new: str, /, *, data_dir: DataDir = DATA) -> None:
         old: Its name.
         new: What to call it.
     """
-    from onedemo.demos.library import find_demo, rename_demo
+    from onedemo.app.services.demo_shelf import rename
 
-    found = find_demo(old, data_dir / "demos")
-    rename_demo(found, new, data_dir / "demos")
     with _store(data_dir) as store:
-        if store is not None:
-            store.runs.rename_demo(found.sha256, new)
+        rename(store, data_dir, old, new)
     print(f"{old} is called {new} now")
 
 
@@ -101,18 +98,10 @@ def remove(name: str, /, *, data_dir: DataDir = DATA) -> None:
     Args:
         name: Its name.
     """
-    from onedemo.demos.library import find_demo, remove_demo
+    from onedemo.app.services.demo_shelf import remove
 
-    found = find_demo(name, data_dir / "demos")
     with _store(data_dir) as store:
-        known = [] if store is None else store.runs.all()
-    runs = [run["id"] for run in known if run["demo_sha256"] == found.sha256]
-    if runs:
-        raise UserError(
-            f"the demo {name} is what {_named(runs)} from, and could not go on without it; if its name is "
-            f"wanted, give it another: onedemo demo rename {name} NEW"
-        )
-    remove_demo(found, data_dir / "demos")
+        remove(store, data_dir, name)
     print(f"{name} is deleted")
 
 
@@ -130,8 +119,3 @@ def _store(data_dir: Path) -> Iterator[Store | None]:
         yield store
     finally:
         store.close()
-
-
-def _named(runs: list[str]) -> str:
-    shown = ", ".join(runs[:3]) + (f" and {len(runs) - 3} more" if len(runs) > 3 else "")
-    return f"run {shown} learns" if len(runs) == 1 else f"runs {shown} learn"

@@ -18,7 +18,7 @@ from onedemo.app.dataset import csv_reader as cell
 from onedemo.app.dataset.exporter import FILES
 from onedemo.app.dataset.parquet import read_about, read_pairs, read_segments
 from onedemo.core.files import write_atomic
-from onedemo.core.names import check_name
+from onedemo.core.names import check_description, check_name
 from onedemo.errors import UserError
 from onedemo.sim.vector_env import spec
 from onedemo.storage.comparisons import ANSWERS
@@ -105,6 +105,7 @@ def import_data(export: Export, data_dir: Path) -> dict[str, int]:
                 store.runs.add(
                     run=run["id"], **{name: run[name] for name in _RUN[1:]},
                     created_at=run.get("created_at"), step_seconds=run.get("step_seconds", 0.008),
+                    title=run.get("title", ""), note=run.get("note", ""),
                 )  # fmt: skip
             try:
                 clips = store.clips.restore(read_segments(export.segments, widths))
@@ -247,6 +248,7 @@ def _check_run(run: Any, file: Path) -> None:
             cell.time(run["created_at"])
         if not 1e-6 < float(run.get("step_seconds", 0.008)) < 10:
             raise ValueError("step_seconds is out of range")
+        check_description(run.get("title", ""), run.get("note", ""))
         if len(run["config"]) > _LONGEST_CONFIG:
             raise ValueError("config is too long")
         tomllib.loads(run["config"])

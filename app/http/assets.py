@@ -81,7 +81,8 @@ def viser_scripts() -> tuple[str, str]:
 def page_policy() -> str:
     """Content-Security-Policy of the page.
 
-    Viser needs WebAssembly, workers and pictures that it makes itself (blob:, data:), and writes styles. It
+    Viser needs WebAssembly, workers and pictures that it makes itself (blob:, data:), and writes styles; a
+    video that somebody chooses to send is played before it is sent (media-src blob:). Viser
     would run JavaScript that its server sends, and sort Gaussian splats with generated code: both need
     unsafe-eval, and stay off. Its files, the socket included, come from here alone.
 
@@ -92,7 +93,8 @@ def page_policy() -> str:
     scripts = " ".join(f"'sha256-{digest}'" for digest in digests)
     return (
         f"default-src 'none'; script-src 'self' 'wasm-unsafe-eval' {scripts}; script-src-attr 'none'; "
-        "worker-src blob:; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; media-src 'self'; "
-        "font-src 'self' data:; connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; "
+        "worker-src blob:; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+        "media-src 'self' blob:; font-src 'self' data:; "
+        "connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; "
         "object-src 'none'; frame-ancestors 'none'"
     )

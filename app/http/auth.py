@@ -98,6 +98,8 @@ class AccessControl:
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         try:
             response = await self._let_in(request, handler)
+        except web.HTTPNotFound as nothing:
+            response = self._nothing_here(request) or nothing
         except web.HTTPException as problem:
             response = problem
         if not response.prepared:
@@ -124,7 +126,7 @@ class AccessControl:
             raise web.HTTPForbidden(text="Nobody may do that.")
         if have < least:
             if have == 0:
-                return self._login_page(401)
+                return await self._ask_for_link(request)
             raise web.HTTPForbidden(text="Only researchers may do that.")
         if request.method == "POST":
             self._check_page(request)
@@ -144,10 +146,40 @@ class AccessControl:
         if not self._is_open(request[RATER].id, page):
             raise web.HTTPConflict(text="This page had lost its connection. Please try again in a moment.")
 
-    def _login_page(self, status: int, note: str = "", token: str = "") -> web.Response:
-        """What to do without a session; with a token, the button that opens its link."""
-        html = render("login.html", base=self._listening.base_path, note=note, token=token, days=SESSION_DAYS)
+    def _login_page(
+        self, status: int, note: str = "", token: str = "", mine: tuple[str, str] | None = None
+    ) -> web.Response:
+        """What to do without a session.
+
+        Args:
+            status: Of the answer.
+            note: What happened.
+            token: With it there is the button that opens its link.
+            mine: Name and address of the page of whoever is signed in here, at an address of another person.
+        """
+        html = render(
+            "login.html", base=self._listening.base_path, note=note, token=token, days=SESSION_DAYS, mine=mine
+        )
         return web.Response(text=html, content_type="text/html", status=status)
+
+    async def _ask_for_link(self, request: web.Request) -> web.Response:
+        """The login page in place of a tab that somebody was sent: signing in leads there."""
+        tab = request.match_info.get("tab", "")
+        rater = await self.sessions.last(request) if "rater" in request.match_info else None
+        mine = None if rater is None else (rater.name, self._listening.page_path(rater.id) + tab)
+        response = self._login_page(401, mine=mine)
+        if tab:
+            self.sessions.keep_tab(request, response, tab)
+        return response
+
+    def _nothing_here(self, request: web.Request) -> web.Response | None:
+        """The answer to somebody who went to an address that there is not; None for a program."""
+        if RATER not in request or "text/html" not in request.headers.get("Accept", ""):
+            return None
+        html = render(
+            "missing.html", base=self._listening.base_path, page=self._listening.page_path(request[RATER].id)
+        )
+        return web.Response(text=html, content_type="text/html", status=404)
 
     async def log_in(self, request: web.Request) -> web.StreamResponse:
         """Trades the token of a link for a cookie; one that opens once gets a page with a button first.
@@ -195,7 +227,8 @@ class AccessControl:
             await asyncio.to_thread(
                 self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}"
             )
-        response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id))
+        tab = self.sessions.kept_tab(request)
+        response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id) + tab)
         self.sessions.put(request, response, opened.rater.id, session)
         return response
 

@@ -7,6 +7,8 @@ from typing import Any
 from markupsafe import Markup
 
 from onedemo.app.http import invitations
+from onedemo.app.services import demo_shelf
+from onedemo.app.services.run_manager import OFFERED
 from onedemo.app.templates import render
 from onedemo.errors import UserError
 from onedemo.storage.rating_records import MOST_REASON
@@ -41,7 +43,8 @@ class Actions:
         actions = {
             "exclude": self._exclude, "include": self._include, "open run": self._open,
             "new run": self._create, "pause run": self._pause, "resume run": self._resume,
-            "withdraw": self._withdraw,
+            "withdraw": self._withdraw, "describe run": self._describe, "delete run": self._delete,
+            "rename demo": self._rename_demo, "remove demo": self._remove_demo,
         }  # fmt: skip
         about_people = {"revoke": self._revoke, "revoke link": self._revoke_link}  # they write their own line
         name, fields = body["do"], {key: value for key, value in body.items() if key != "do"}
@@ -118,9 +121,34 @@ class Actions:
         self._page.trainer.resume()
 
     def _create(self, who: Rater, fields: dict[str, Any]) -> None:
+        # What is left empty is as usual.
+        given = {key: fields.pop(key) for key in OFFERED if key in fields}
+        settings = {key: value for key, value in given.items() if value not in (None, "")}
+        if not all(isinstance(v, (int, float, str)) and len(str(v)) <= 40 for v in settings.values()):
+            raise ValueError("a setting is a number or a word")
         _check(fields, {"demo": str, "method": str, "seed": int, "name": str, "predictor_from": str})
         texts = {name: fields[name].strip() or None for name in ("name", "predictor_from")}
-        self._study.create(demo=fields["demo"], method=fields["method"], seed=fields["seed"], **texts)
+        self._study.create(
+            demo=fields["demo"], method=fields["method"], seed=fields["seed"], settings=settings, **texts
+        )
+        fields |= settings
+
+    def _describe(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"run": str, "title": str, "note": str}, longest=500)
+        title, note = fields["title"].strip(), fields["note"].strip()
+        self._study.describe(fields["run"], title=title, note=note)
+
+    def _delete(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"run": str})
+        self._study.delete(fields["run"])
+
+    def _rename_demo(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"demo": str, "name": str})
+        demo_shelf.rename(self._store, self._store.path.parent, fields["demo"], fields["name"].strip())
+
+    def _remove_demo(self, who: Rater, fields: dict[str, Any]) -> None:
+        _check(fields, {"demo": str})
+        demo_shelf.remove(self._store, self._store.path.parent, fields["demo"])
 
     @property
     def _store(self) -> Store:

@@ -55,6 +55,8 @@ _HEALTH_S = 5.0
 _THREADS = 32
 """For whatever may take long: exports, uploads, links. They wait for the disk, not for each other."""
 _PRESSING_THREADS = 8
+UPLOAD = r"/demos/{upload:[0-9a-f]{32}}"
+"""Where a video is that was sent and not kept yet."""
 _TLS_ALONE = {"Strict-Transport-Security": "max-age=31536000"}
 
 
@@ -88,6 +90,10 @@ class Inside(Protocol):
 
     def is_open(self, rater_id: int, token: str) -> bool:
         """Whether somebody has a page of that name open."""
+        ...
+
+    def tabs(self, role: str) -> list[str]:
+        """The tabs of a role as their addresses end, the first one first."""
         ...
 
 
@@ -147,7 +153,8 @@ class Front:
 
     def routes(self) -> tuple[Route, ...]:
         """All there is, each with the least role that it asks for."""
-        files, downloads, sessions = self._files, self._downloads, self._access.sessions
+        files, downloads, uploads = self._files, self._downloads, self._uploads
+        sessions = self._access.sessions
         # The page asks for these below its person; programs may leave the person out.
         either = (
             Route("GET", "/static/{name}", "annotator", files.static),
@@ -166,7 +173,13 @@ class Front:
             Route("GET", "/card.md", "researcher", downloads.card, "downloaded the data card"),
             Route("GET", "/preview", "researcher", downloads.preview),
             Route("GET", "/ratings", "researcher", downloads.given),
-            Route("POST", "/demos", "researcher", self._uploads.add, "uploaded a demo"),
+            Route("GET", r"/demos/{demo:[0-9a-f]{64}}.jpg", "researcher", uploads.picture),
+            Route("POST", "/demos", "researcher", uploads.add, "uploaded a video"),
+            Route("GET", UPLOAD + "/poster.jpg", "researcher", uploads.poster),
+            Route("POST", UPLOAD + "/result", "researcher", uploads.bring_in),
+            Route("GET", UPLOAD + r"/result-{result:\d{1,6}}.webm", "researcher", uploads.result),
+            Route("POST", UPLOAD + "/keep", "researcher", uploads.keep, "added a demo"),
+            Route("POST", UPLOAD + "/discard", "researcher", uploads.discard),
         )
         return (
             Route("GET", "/login", "stranger", self._access.log_in),
@@ -187,6 +200,7 @@ class Front:
             Route("POST", PERSON + "/do", "researcher", self._do),
             *either,
             *(route._replace(path=PERSON + route.path) for route in either),
+            Route("GET", PERSON + r"/{tab:[a-z]{1,20}}", "annotator", self._page_of),
         )
 
     def start(self) -> str:
@@ -255,6 +269,7 @@ class Front:
         finally:
             await self._connections.close()
             await self._proxy.close()
+            self._uploads.close()
             await runner.cleanup()
 
     async def _add_headers(self, request: web.Request, response: web.StreamResponse) -> None:
@@ -272,12 +287,17 @@ class Front:
         raise web.HTTPSeeOther(self._listening.page_path(request[RATER].id))
 
     async def _page_of(self, request: web.Request) -> web.StreamResponse:
+        rater, tab = request[RATER], request.match_info.get("tab", "")
+        if tab and tab not in self._page.tabs(rater.role):
+            if tab not in self._page.tabs("researcher"):
+                raise web.HTTPNotFound()
+            raise web.HTTPSeeOther(self._listening.page_path(rater.id))  # sent by somebody who has more
         if request.headers.get("Upgrade", "").lower() == "websocket":
             return await self._proxy.socket(request)
         # Viser's client does what a query tells it, such as to show a recording from elsewhere. And the
         # addresses in the page hold only below the person.
-        if request.query_string or not request.path.endswith("/"):
-            raise web.HTTPSeeOther(self._listening.page_path(request[RATER].id))
+        if request.query_string or not (tab or request.path.endswith("/")):
+            raise web.HTTPSeeOther(self._listening.page_path(rater.id) + tab)
         self._proxy.expect(request)
         headers = {"Content-Security-Policy": self._policy}
         return web.Response(text=self._html, content_type="text/html", headers=headers)

@@ -9,6 +9,7 @@ everybody, names the session of the link that was opened last: it is for address
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -29,6 +30,8 @@ PERSON = r"/r/{rater:\d{1,9}}"
 
 _T = TypeVar("_T")
 _THREADS = 4
+_TAB_KEPT_S = 600
+"""Between the address of a tab and the link that opens it."""
 _MOST_VALUES = 4
 """Cookies of one name that are looked at; a browser sends those of the longest path first."""
 _ENDED = {
@@ -79,6 +82,33 @@ class Sessions:
                 secure=self._listening.encrypted(request),
                 path=path,
             )
+        if self.kept_tab(request):
+            response.del_cookie(self._tab_name, path=f"{self._listening.base_path}/")
+
+    async def last(self, request: web.Request) -> Rater | None:
+        """Who opened a link here last, whomever the address names."""
+        for token in list(_values(request, self._name(None)))[:_MOST_VALUES]:
+            rater = await self._ask(self._store.accounts.rater_of, hash_token(token), "session")
+            if rater is not None:
+                return rater
+        return None
+
+    def keep_tab(self, request: web.Request, response: web.StreamResponse, tab: str) -> None:
+        """Has the browser remember for a while which tab it was sent to, until a link is opened."""
+        response.set_cookie(
+            self._tab_name,
+            tab,
+            max_age=_TAB_KEPT_S,
+            httponly=True,
+            samesite="Lax",
+            secure=self._listening.encrypted(request),
+            path=f"{self._listening.base_path}/",
+        )
+
+    def kept_tab(self, request: web.Request) -> str:
+        """That tab, "" if there is none."""
+        kept = next(_values(request, self._tab_name), "")
+        return kept if re.fullmatch(r"[a-z]{1,20}", kept) else ""
 
     async def state(self, request: web.Request) -> web.Response:
         """Whether the session still holds: 204, or 401 with the reason in a sentence."""
@@ -110,6 +140,10 @@ class Sessions:
     def _both(self, rater: int) -> tuple[tuple[str, str], tuple[str, str]]:
         base = self._listening.base_path
         return (self._name(rater), f"{base}/r/{rater}"), (self._name(None), f"{base}/")
+
+    @property
+    def _tab_name(self) -> str:
+        return f"{self._name(None)}-tab"
 
     def _name(self, rater: int | None) -> str:
         # Browsers share cookies between the ports of a host; two studies on one machine must not.

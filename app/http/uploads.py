@@ -1,24 +1,37 @@
-"""A video that a researcher sends over HTTP becomes a demo.
+"""A video that a researcher sends over HTTP becomes a demo, in steps.
 
-It is streamed to a file under a name of our own, decoded by a limited child
-(``onedemo.demos.sandboxed_decoder``) and
-added exactly as ``onedemo demo add`` does. Whatever happens, the file is gone afterwards.
+``POST /demos`` streams it to a file under a name of our own; nothing is decoded but one frame. Then any
+number of times a part of it is chosen, brought in (``result``) and looked at, exactly as ``onedemo demo add``
+does it, but not yet in the library; at last it is kept, or discarded. All decoding is done by a limited child
+(``onedemo.demos.sandboxed_decoder``).
+
+What is not kept lies in ``uploads/`` of the data directory, which no backup saves, and is gone after an hour,
+or once this process has ended.
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
+import secrets
+import shutil
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from aiohttp import BodyPartReader, web
 
+from onedemo.app.network.refusals import read_json
 from onedemo.core.directories import Workshop, clear_left_over, make_directory
 from onedemo.core.files import private_opener
-from onedemo.demos.import_checks import read_crop
-from onedemo.demos.library import import_video
+from onedemo.demos.containers import check_file
+from onedemo.demos.import_checks import check_options
+from onedemo.demos.library import demo_picture, keep_demo, known_demo, prepare_demo
+from onedemo.demos.sandboxed_decoder import Look, Options, look
+from onedemo.demos.video import jpeg
 from onedemo.errors import UserError
 
 LARGEST = 500 << 20
@@ -26,9 +39,31 @@ LARGEST = 500 << 20
 LONGEST_SECONDS = 600.0
 """Until a video has arrived."""
 MOST_AT_ONCE = 2
-"""Uploads, with their decoding."""
-_LONGEST_FIELD = 200
-_FIELDS = ("name", "start", "end", "crop", "mirror")
+"""Videos that arrive or are decoded at one time."""
+MOST_WAITING = 4
+"""Videos that are neither kept nor discarded; the oldest goes when another comes."""
+WAIT_SECONDS = 3600.0
+"""That such a video stays after it was last asked for."""
+
+_T = TypeVar("_T")
+
+
+@dataclass(slots=True)
+class _Upload:
+    place: Workshop
+    look: Look
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    end: asyncio.TimerHandle | None = None
+    shown: int = 0
+    """Results so far: each has an address of its own, so that no browser shows an earlier one."""
+
+    @property
+    def video(self) -> Path:
+        return self.place.path / "video"
+
+    @property
+    def result(self) -> Path:
+        return self.place.path / f"result-{self.shown}"
 
 
 class Uploads:
@@ -38,91 +73,240 @@ class Uploads:
         data_dir: Where the demos are; what an earlier process left of its uploads is removed.
         largest: Bytes of a video.
         longest: Seconds until it has arrived.
+        wait: Seconds that one which is neither kept nor discarded stays.
     """
 
-    def __init__(self, data_dir: Path, *, largest: int = LARGEST, longest: float = LONGEST_SECONDS) -> None:
+    def __init__(
+        self, data_dir: Path, *, largest: int = LARGEST, longest: float = LONGEST_SECONDS,
+        wait: float = WAIT_SECONDS,
+    ) -> None:  # fmt: skip
         self._demos_dir, self._place = data_dir / "demos", data_dir / "uploads"
-        self._largest, self._longest = largest, longest
-        self._open = 0
+        self._largest, self._longest, self._wait = largest, longest, wait
+        self._busy = 0
+        self._waiting: dict[str, _Upload] = {}
+        self._pictures: dict[str, bytes] = {}
         clear_left_over(self._place, "upload-")  # not of another server, which may be at it
         clear_left_over(self._demos_dir, ".import-")
 
+    def close(self) -> None:
+        """Discards what waits."""
+        for name in list(self._waiting):
+            self._end(name)
+
     async def add(self, request: web.Request) -> web.Response:
-        """Answers a form with ``name``, if wanted ``start``, ``end``, ``crop``, ``mirror``, last ``video``.
+        """Takes a form whose one field is ``video``; answers what it is: JSON.
 
-        The answer is one sentence: what the demo is now, or what was wrong; ``X-Demo`` is the demo's name.
+        ``upload`` names it from now on; ``width`` and ``height`` are pixels of the upright video; ``seconds``
+        and ``fps`` are by the container's word, 0 where it does not say.
         """
-        if self._open >= MOST_AT_ONCE:
-            raise web.HTTPServiceUnavailable(text="Other videos are being uploaded; try again in a minute.")
-        self._open += 1
-        path = None
-        try:
+        with self._at_work(), _sentences("video"):
             make_directory(self._place, private=True)
-            with Workshop(self._place, "upload-") as place:
-                path = place / "video"
-                with open(path, "xb", opener=private_opener) as file:
-                    async with asyncio.timeout(self._longest):
-                        fields = await self._receive(request, file)
-                options = {"demos_dir": self._demos_dir, "source": "uploaded"} | _options(fields)
-                demo = await asyncio.to_thread(partial(import_video, path, **options))
-        except TimeoutError:
-            raise web.HTTPRequestTimeout(
-                text=f"The video did not arrive within {self._longest:g} s; send a shorter one."
-            ) from None
-        except (UserError, ValueError) as error:
-            said = str(error).replace(str(path), "the video").replace("--", "")
-            raise web.HTTPBadRequest(text=f"{said[:1].upper()}{said[1:]}.") from None
-        except OSError as error:
-            raise web.HTTPInsufficientStorage(
-                text=f"The video could not be stored ({error.strerror or error})."
-            ) from None
-        finally:
-            self._open -= 1
-        known = demo.name != fields["name"]
-        said = f"This video is known already, as {demo.name}" if known else f"{demo.name} is a demo now"
-        return web.Response(
-            text=f"{said}: {demo.seconds:.1f} s, {demo.frames} frames.", headers={"X-Demo": demo.name}
-        )
-
-    async def _receive(self, request: web.Request, file: Any) -> dict[str, str]:
-        """Writes the video to the file; returns the other fields. The file's own name is not looked at."""
-        if not request.content_type.startswith("multipart/form-data"):
-            raise ValueError("an upload is a form with a name and a video")
-        fields: dict[str, str] = {}
-        parts = await request.multipart()
-        while (part := await parts.next()) is not None:
-            if not isinstance(part, BodyPartReader):
+            place = Workshop(self._place, "upload-")
+            try:
+                path = place.path / "video"
+                try:
+                    with open(path, "xb", opener=private_opener) as file:
+                        async with asyncio.timeout(self._longest):
+                            await self._receive(request, file)
+                except TimeoutError:
+                    raise web.HTTPRequestTimeout(
+                        text=f"The video did not arrive within {self._longest:g} s; send a shorter one."
+                    ) from None
+                with _named(path):
+                    await asyncio.to_thread(check_file, path)
+                    found = await asyncio.to_thread(look, path)
+            except BaseException:
+                place.__exit__()
+                raise
+        name, upload = secrets.token_hex(16), _Upload(place, found)
+        for oldest in [each for each, other in self._waiting.items() if not other.lock.locked()]:
+            if len(self._waiting) < MOST_WAITING:
                 break
-            if part.name == "video":
-                size = 0
-                while chunk := await part.read_chunk(1 << 16):
-                    size += len(chunk)
-                    if size > self._largest:
-                        raise ValueError(
-                            f"the video is larger than {self._largest / 2**20:g} MB; scale it down"
-                        )
-                    await asyncio.to_thread(file.write, chunk)
-                return fields
-            if part.name not in _FIELDS or part.name in fields:
-                break
-            text = await part.read_chunk(_LONGEST_FIELD + 1)
-            if len(text) > _LONGEST_FIELD or await part.read_chunk(1):
-                raise ValueError(f"{part.name} is up to {_LONGEST_FIELD} characters")
-            fields[part.name] = text.decode("utf-8", "replace").strip()
-        raise ValueError(f"an upload has the fields {', '.join(_FIELDS)} and, as the last, video")
+            self._end(oldest)
+        self._waiting[name] = upload
+        self._wait_on(name)
+        told = {"width": found.width, "height": found.height, "seconds": found.seconds, "fps": found.fps}
+        return web.json_response({"upload": name, **told})
 
+    async def poster(self, request: web.Request) -> web.Response:
+        """One frame, JPEG, at most 640 px long: query ``at``, in seconds. For what a browser cannot play."""
+        async with self._upload(request) as upload:
+            with _sentences("video"), _named(upload.video):
+                at = _seconds(request.query.get("at") or 0.0, "at")
+                found = upload.look
+                if at:
+                    with self._at_work():
+                        found = await asyncio.to_thread(partial(look, upload.video, at=at))
+                return _picture(await asyncio.to_thread(jpeg, found.picture))
 
-def _options(fields: dict[str, str]) -> dict[str, Any]:
-    times = {}
-    for name in ("start", "end"):
+    async def bring_in(self, request: web.Request) -> web.Response:
+        """Makes what the demo would be; answers with its facts: JSON.
+
+        Takes ``{"start": s, "end": s, "crop": [x, y, width, height], "mirror": bool}``; each may be null.
+        """
+        async with self._upload(request) as upload:
+            with self._at_work(), _sentences("video"), _named(upload.video):
+                options = _options(await read_json(request))
+                shutil.rmtree(upload.result, ignore_errors=True)
+                upload.shown += 1
+                make_directory(upload.result, private=True)
+                warnings: list[str] = []
+                work = partial(
+                    prepare_demo, upload.video, options, upload.result, source="uploaded",
+                    warn=warnings.append,
+                )  # fmt: skip
+                demo = await asyncio.to_thread(work)
+                known = await asyncio.to_thread(known_demo, demo.sha256, self._demos_dir)
+        facts = {name: getattr(demo, name) for name in ("seconds", "frames", "fps", "width", "height")}
+        said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in warnings]
+        about = {"result": upload.shown, "known": known.name if known else None, "warnings": said}
+        return web.json_response(facts | about)
+
+    async def result(self, request: web.Request) -> web.StreamResponse:
+        """What the demo would be, as video."""
+        async with self._upload(request) as upload:
+            path = upload.result / "video.webm"
+            if request.match_info["result"] != str(upload.shown) or not path.is_file():
+                raise web.HTTPNotFound()
+            return web.FileResponse(path, headers={"Content-Type": "video/webm"})
+
+    async def keep(self, request: web.Request) -> web.Response:
+        """Makes it a demo, called as the query's ``name`` says; answers its name, which it may have had."""
+        async with self._upload(request) as upload:
+            with _sentences("name"):
+                if not (upload.result / "demo.json").is_file():
+                    raise ValueError("choose a part and look at the result first")
+                name = request.query.get("name", "").strip()
+                work = partial(keep_demo, upload.result, name, self._demos_dir)
+                demo = await asyncio.to_thread(work)
+        self._end(request.match_info["upload"])
+        return web.json_response({"name": demo.name, "known": demo.name != name})
+
+    async def discard(self, request: web.Request) -> web.Response:
+        """Deletes what was sent."""
+        async with self._upload(request):
+            pass
+        self._end(request.match_info["upload"])
+        return web.Response(status=204)
+
+    async def picture(self, request: web.Request) -> web.Response:
+        """A frame of a demo of the library, JPEG."""
+        sha256 = request.match_info["demo"]
+        if sha256 not in self._pictures:
+            demo = await asyncio.to_thread(known_demo, sha256, self._demos_dir)
+            try:
+                picture = await asyncio.to_thread(demo_picture, demo) if demo else None
+            except UserError:  # its video is gone or damaged
+                picture = None
+            if picture is None:
+                raise web.HTTPNotFound()
+            self._pictures[sha256] = picture
+        return _picture(self._pictures[sha256], {"Cache-Control": "private, max-age=31536000, immutable"})
+
+    # What waits
+
+    @contextmanager
+    def _at_work(self) -> Iterator[None]:
+        if self._busy >= MOST_AT_ONCE:
+            raise web.HTTPServiceUnavailable(text="Other videos are being uploaded; try again in a minute.")
+        self._busy += 1
         try:
-            times[name] = float(fields[name]) if fields.get(name) else None
-        except ValueError:
-            times[name] = math.nan
-        if times[name] is not None and not math.isfinite(times[name]):
-            raise ValueError(f"{name} is a number of seconds")
+            yield
+        finally:
+            self._busy -= 1
+
+    @asynccontextmanager
+    async def _upload(self, request: web.Request) -> AsyncIterator[_Upload]:
+        """What an address names, for one request at a time."""
+        name = request.match_info["upload"]
+        gone = web.HTTPGone(text="This video is not here any more. Please choose it again.")
+        if (upload := self._waiting.get(name)) is None:
+            raise gone
+        self._wait_on(name)
+        async with upload.lock:
+            if name not in self._waiting:
+                raise gone
+            yield upload
+
+    def _wait_on(self, name: str) -> None:
+        upload = self._waiting[name]
+        if upload.end is not None:
+            upload.end.cancel()
+        upload.end = asyncio.get_running_loop().call_later(self._wait, self._end, name)
+
+    def _end(self, name: str) -> None:
+        if (upload := self._waiting.get(name)) is None:
+            return
+        if upload.end is not None:
+            upload.end.cancel()
+        if upload.lock.locked():  # it is being brought in
+            self._wait_on(name)
+            return
+        del self._waiting[name]
+        upload.place.__exit__()
+
+    async def _receive(self, request: web.Request, file: Any) -> None:
+        """Writes the video to the file. What it is called, or its type, is not looked at."""
+        if not request.content_type.startswith("multipart/form-data"):
+            raise ValueError("an upload is a form with a video")
+        part = await (await request.multipart()).next()
+        if not isinstance(part, BodyPartReader) or part.name != "video":
+            raise ValueError("an upload has one field, video")
+        size = 0
+        while chunk := await part.read_chunk(1 << 16):
+            size += len(chunk)
+            if size > self._largest:
+                raise ValueError(f"the video is larger than {self._largest / 2**20:g} MB; scale it down")
+            await asyncio.to_thread(file.write, chunk)
+
+
+@contextmanager
+def _sentences(what: str) -> Iterator[None]:
+    """What was wrong as one sentence to whoever asked."""
     try:
-        crop = read_crop(fields["crop"]) if fields.get("crop") else None
-    except ValueError as error:
-        raise ValueError(f"the part of the video {error}") from None
-    return {"name": fields.get("name", ""), "crop": crop, "mirror": fields.get("mirror") == "on", **times}
+        yield
+    except (UserError, ValueError) as error:
+        said = str(error).replace("--", "")
+        raise web.HTTPBadRequest(text=f"{said[:1].upper()}{said[1:]}.") from None
+    except OSError as error:
+        raise web.HTTPInsufficientStorage(
+            text=f"The {what} could not be stored ({error.strerror or error})."
+        ) from None
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Sentences about a file of ours are about the video."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(str(error).replace(str(path), "the video")) from None
+
+
+def _picture(data: bytes, headers: dict[str, str] | None = None) -> web.Response:
+    return web.Response(body=data, content_type="image/jpeg", headers=headers)
+
+
+def _seconds(value: Any, name: str) -> float:
+    try:
+        seconds = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        seconds = math.nan
+    if not 0 <= seconds < 1e6:
+        raise ValueError(f"{name} is a number of seconds")
+    return seconds
+
+
+def _options(body: Any) -> Options:
+    if not isinstance(body, dict) or not set(body) <= {"start", "end", "crop", "mirror"}:
+        raise ValueError("a part of a video has start, end, crop and mirror")
+    times = {
+        name: None if body.get(name) is None else _seconds(body[name], name) for name in ("start", "end")
+    }
+    crop = body.get("crop")
+    if crop is not None:
+        if not (isinstance(crop, list) and len(crop) == 4 and all(type(side) is int for side in crop)):
+            raise ValueError("the part of the picture is four whole numbers: x, y, width, height")
+        crop = tuple(max(-1, min(side, 1 << 20)) for side in crop)
+    check_options(**times, crop=crop, fps=30.0)
+    return Options(**times, crop=crop, mirror=body.get("mirror") is True)

@@ -46,6 +46,7 @@ log = logging.getLogger("onedemo.page")
 RATER_HEADER = "X-Onedemo-Rater"
 SECRET_HEADER = "X-Onedemo-Secret"
 SCHEME_HEADER = "X-Onedemo-Scheme"
+TAB_HEADER = "X-Onedemo-Tab"
 
 _PROTOCOL = re.compile(r"viser-v[0-9A-Za-z.+-]{1,40}")
 _CONNECT_S = 10.0
@@ -153,6 +154,7 @@ class Proxy:
             RATER_HEADER: str(request[RATER].id),
             SECRET_HEADER: self._page.secret,
             SCHEME_HEADER: scheme,
+            TAB_HEADER: request.match_info.get("tab", ""),
         }
         try:
             async with asyncio.timeout(_CONNECT_S):

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from onedemo.config import METHODS, RunConfig, load_config, settings_for_another
+from onedemo.core.directories import Workshop, sync_directory
 from onedemo.core.files import hold
 from onedemo.core.log_limit import LogLimit
+from onedemo.core.names import check_description
 from onedemo.demos.library import find_demo, list_demos
 from onedemo.errors import UserError
 from onedemo.render.renderer import Drawing
@@ -24,6 +28,12 @@ from onedemo.training.thread import Trainer
 from onedemo.training.training_run import TrainingRun
 from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
+
+OFFERED = (
+    "ratings.pretrain", "ratings.online", "rollouts.total_steps", "ratings.clip_seconds", "ratings.choice",
+)  # fmt: skip
+"""Settings that a new run may be given in the browser, besides method and seed. The others are as in the
+run at hand."""
 
 
 class Study:
@@ -87,23 +97,22 @@ class Study:
         with self._change:
             if run == self.trainer.run:
                 raise UserError(f"run {run!r} is being served already")
-            known = {entry["id"]: entry for entry in self._store.runs.all()}
-            if run not in known:
-                raise UserError(f"no run {run!r}; there are: {', '.join(known)}")
-            place, sha256 = self._data_dir / "demos", known[run]["demo_sha256"]
+            entry = self._known(run)
+            place, sha256 = self._data_dir / "demos", entry["demo_sha256"]
             # Of the same pictures, whatever its name is by now.
             same = next((demo for demo in list_demos(place) if demo.sha256 == sha256), None)
-            demo = same or find_demo(known[run]["demo"], place)
+            demo = same or find_demo(entry["demo"], place)
             found = find_run(self._store, self._data_dir, demo, name=run, wanted=None)
             assert found is not None
             self._switch(run, demo, found[1])
 
     def create(
-        self, *, demo: str, method: str, seed: int, name: str | None = None, predictor_from: str | None = None
-    ) -> str:
+        self, *, demo: str, method: str, seed: int, name: str | None = None,
+        predictor_from: str | None = None, settings: Mapping[str, Any] | None = None,
+    ) -> str:  # fmt: skip
         """Makes a run and serves it; returns its name.
 
-        It has the settings of the run at hand, as far as its method is the same.
+        Where nothing else is said it has the settings of the run at hand, as far as its method is the same.
 
         Args:
             demo: What is to be learned.
@@ -111,6 +120,7 @@ class Study:
             seed: Of everything random.
             name: What to call it; None: the demo's name and a number.
             predictor_from: Run from whose predictor it starts.
+            settings: Those of ``OFFERED`` that were chosen, by key.
 
         Raises:
             UserError: If something of it cannot be; then all stays as it is.
@@ -119,7 +129,8 @@ class Study:
             if method not in METHODS:
                 raise UserError(f"there is no method {method!r}; choose from: {', '.join(METHODS)}")
             kept = settings_for_another(self.trainer.config, method)
-            config = load_config(None, kept | {"seed": seed, "device": self._device})
+            chosen = {key: value for key, value in (settings or {}).items() if key in OFFERED}
+            config = load_config(None, kept | chosen | {"seed": seed, "device": self._device})
             start = None
             if predictor_from is not None:
                 start = newest_snapshot(self._store, self._data_dir, predictor_from)
@@ -128,6 +139,48 @@ class Study:
             run = add_run(self._store, self._data_dir, found, config, name=name)
             self._switch(run, found, config, start=start)
             return run
+
+    def describe(self, run: str, *, title: str, note: str) -> None:
+        """Notes what people call a run and say of it; its name stays.
+
+        Raises:
+            UserError: If there is no such run, or that cannot be shown.
+        """
+        self._known(run)
+        check_description(title, note)
+        self._store.runs.describe(run, title=title, note=note)
+
+    def delete(self, run: str) -> None:
+        """Deletes a run with its ratings and files: there is no way back but a backup.
+
+        Raises:
+            UserError: If there is no such run, or somebody works on it, here or in another process.
+        """
+        with self._change:
+            self._known(run)
+            if run == self.trainer.run:
+                raise UserError(f"run {run!r} is the one being served; open another one first")
+            files = RunDirectory(self._data_dir, run)
+            with ExitStack() as held:
+                try:
+                    held.enter_context(hold(files.lock))
+                except UserError:
+                    raise UserError(f"another onedemo works on run {run!r}; stop that first") from None
+                away = held.enter_context(Workshop(files.path.parent, ".deleted-")) / "run"
+                os.replace(files.path, away)  # at once: half a run would be a damaged one
+                try:
+                    self._store.runs.delete(run)
+                except BaseException:
+                    os.replace(away, files.path)
+                    raise
+                sync_directory(files.path.parent)
+
+    def _known(self, run: str) -> dict[str, Any]:
+        """A run's record, as ``Runs.all``; UserError if there is none."""
+        known = {entry["id"]: entry for entry in self._store.runs.all()}
+        if run not in known:
+            raise UserError(f"no run {run!r}; there are: {', '.join(known)}")
+        return known[run]
 
     def close(self) -> None:
         """Stops the run at hand."""

@@ -21,7 +21,7 @@ from onedemo.app.annotation.assignment import REPEAT_AFTER, Again, Assignment
 from onedemo.app.annotation.presses import PageGone, Press, Rate, Skip
 from onedemo.app.annotation.rating_session import GUARD_SECONDS
 from onedemo.app.annotation.tutorial import Lesson
-from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER
+from onedemo.app.http.viser_proxy import RATER_HEADER, SCHEME_HEADER, SECRET_HEADER, TAB_HEADER
 from onedemo.app.services.demo_images import Pictures, version_of
 from onedemo.app.services.live_rollout import Live
 from onedemo.app.services.run_manager import Study
@@ -125,6 +125,10 @@ class Page:
         """Whether a rater has a page of that name open."""
         return self._open(rater_id, token) is not None
 
+    def tabs(self, role: str) -> list[str]:
+        """The tabs of a role as their addresses end, the first one first."""
+        return [maker.title.lower() for maker in tabs_of(role, compare=self._compare)]
+
     def _open(self, rater_id: int, token: str) -> Session | None:
         with self._lock:
             sessions = list(self._sessions.values())
@@ -144,7 +148,8 @@ class Page:
             return
         try:
             context = self._context(client, rater, dark=headers.get(SCHEME_HEADER) == "dark")
-            session = Session(context, tabs_of(rater.role, compare=self._compare))
+            makers = tabs_of(rater.role, compare=self._compare)
+            session = Session(context, makers, first=headers.get(TAB_HEADER, ""))
         except Exception:
             log.exception("the page of %s could not be built", rater.name)
             hang_up(self._server, client.client_id)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from onedemo.app.annotation.presses import Press
 from onedemo.app.tabs.context import TabContext
@@ -18,7 +17,16 @@ from onedemo.app.templates import render
 from onedemo.types import Status
 
 _BRAND = (47, 93, 196)
-TabMaker = Callable[[TabContext], Tab]
+
+
+class TabMaker(Protocol):
+    """What makes a tab, such as its class; ``title`` is known before."""
+
+    title: str
+
+    def __call__(self, context: TabContext, /) -> Tab:
+        """Adds its elements to a session."""
+        ...
 
 
 class Session:
@@ -27,9 +35,10 @@ class Session:
     Args:
         context: What its tabs may use.
         makers: Its tabs, in order.
+        first: The tab that is shown first, as its address ends; the first one if there is none of that name.
     """
 
-    def __init__(self, context: TabContext, makers: list[TabMaker]) -> None:
+    def __init__(self, context: TabContext, makers: list[TabMaker], first: str = "") -> None:
         self.rater = context.rater
         self.token = secrets.token_urlsafe(16)
         """Names this page to requests of its browser."""
@@ -60,7 +69,8 @@ class Session:
             )
             self._shown = 0
             self.refresh(context.training.status())
-            self.choose(self._first())
+            names = [tab.title.lower() for tab in self._tabs]
+            self.choose(names.index(first) if first in names else self._first())
 
     def _first(self) -> int:
         """The tab that is shown first: of a researcher's page Watch, once there is an iteration."""
@@ -83,7 +93,8 @@ class Session:
                 self._tabs[index].show()
                 header = render(
                     "session.html:header", titles=[tab.title for tab in self._tabs], shown=index,
-                    demo=self._context.demo.name, name=self.rater.name, page=self.token,
+                    run=self._context.run, demo=self._context.demo.name, name=self.rater.name,
+                    page=self.token,
                 )  # fmt: skip
                 self._header.content = str(header)
 

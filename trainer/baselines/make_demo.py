@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from onedemo.core.names import check_name
+from onedemo.core.outputs import check_outputs
 from onedemo.demos.ground_truth import SUFFIX, load_hidden
 from onedemo.demos.library import BUILT_IN, render_demo, show
 
@@ -23,6 +25,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--source", required=True, help="what made the motion")
     parser.add_argument("--out", type=Path, default=BUILT_IN, help="where the states lie")
     asked = parser.parse_args(arguments)
+    check_outputs(asked.out / f"{check_name(asked.name)}.webm", asked.out / f"{asked.name}.json")
     qpos = load_hidden(asked.out / f"{asked.name}{SUFFIX}").qpos
     demo = render_demo(qpos, name=asked.name, task=asked.task, source=asked.source, out_dir=asked.out)
     print(show(demo))

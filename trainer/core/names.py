@@ -39,6 +39,13 @@ def check_new_name(name: str) -> None:
         )
 
 
+def check_description(title: str, note: str) -> None:
+    """Raises UserError unless people may call something so and say that of it; "" is nothing."""
+    for what, text, most in (("title", title, LONGEST), ("note", note, 500)):
+        if not isinstance(text, str) or len(text) > most or not (text == "" or text.isprintable()):
+            raise UserError(f"a {what} is up to {most} printable characters on one line")
+
+
 def check_person(name: str) -> str:
     """A person's name as it is kept: letters of any script and digits, single spaces, and ``-_.'@,()+&#``.
 

@@ -16,7 +16,7 @@ import resource
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import BinaryIO
 
@@ -26,21 +26,24 @@ import numpy as np
 
 from onedemo.demos.import_checks import STORED_SIDE, SourceWatch, check_length, check_size
 from onedemo.demos.resampling import resample
-from onedemo.demos.sandboxed_decoder import MAX_SENTENCE, SIZE, Options
-from onedemo.demos.source import Source
+from onedemo.demos.sandboxed_decoder import LENGTH, LOOK, MAX_SENTENCE, SIZE, Options
+from onedemo.demos.source import Shown, Source
 from onedemo.errors import UserError
 
 _TINY = b"YUV4MPEG2 W16 H16 F10:1 It C420jpeg\n" + (b"FRAME\n" + bytes(16 * 16 * 3 // 2)) * 4
 """An interlaced video."""
 
 
-def shaped_frames(file: BinaryIO, name: str, options: Options) -> Iterator[np.ndarray]:
+def shaped_frames(
+    file: BinaryIO, name: str, options: Options, warn: Callable[[str], object] = lambda _: None
+) -> Iterator[np.ndarray]:
     """The same frames, decoded in this process: for files that are trusted, and for the child.
 
     Args:
         file: Open for reading.
         name: What sentences call it.
         options: The part that is wanted.
+        warn: Called at the end with each sentence about what is not as it should be, though usable.
 
     Raises:
         UserError: If the video is unusable; frames may have come before.
@@ -60,6 +63,22 @@ def shaped_frames(file: BinaryIO, name: str, options: Options) -> Iterator[np.nd
             yield shaped
             count += 1
         watch.check_whole(count, options.fps)
+        for sentence in watch.warnings(*shaped.shape[1::-1]):
+            warn(sentence)
+
+
+def _look(file: BinaryIO, name: str, at: float) -> tuple[Source, np.ndarray]:
+    """A video, and its frame at a moment, the last one if it has ended by then."""
+    with Source(file, name) as source:
+        check_size(name, source.width, source.height, (0, 0, source.width, source.height))
+        shown: Shown | None = None
+        for following in source.frames(at):
+            if shown is not None and following.seconds > at + 1e-4:
+                break
+            shown = following
+        if shown is None:
+            raise UserError(f"{name} has no frame that can be decoded")
+        return source, _shape(shown.picture(), crop=None, mirror=False)
 
 
 def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
@@ -105,7 +124,7 @@ def _watch_memory(memory: int) -> None:
 
 
 def _main(told: str) -> None:
-    path, options, memory, cpu_seconds = json.loads(told)
+    path, options, memory, cpu_seconds, look = json.loads(told)
     crop = options.pop("crop")
     file, out = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb", buffering=1 << 16)
     cv2.setNumThreads(1)
@@ -114,11 +133,19 @@ def _main(told: str) -> None:
     _limit(memory, cpu_seconds)
     try:
         wanted = Options(**options, crop=tuple(crop) if crop else None)
-        for number, frame in enumerate(shaped_frames(file, path, wanted)):
+        warnings: list[str] = []
+        frames = shaped_frames(file, path, wanted, warnings.append)
+        if look:
+            source, picture = _look(file, path, wanted.start or 0.0)
+            out.write(b"L" + LOOK.pack(source.width, source.height, source.seconds, source.fps))
+            frames = iter((picture,))
+        for number, frame in enumerate(frames):
             if number == 0:
                 out.write(b"S" + SIZE.pack(frame.shape[1], frame.shape[0]))
             out.write(b"F")
             out.write(frame.data)
+        for warning in (sentence.encode("utf-8", "replace")[:MAX_SENTENCE] for sentence in warnings):
+            out.write(b"W" + LENGTH.pack(len(warning)) + warning)
         out.write(b"D")
     except UserError as error:
         out.write(b"E" + str(error).encode("utf-8", "replace")[:MAX_SENTENCE])

@@ -31,6 +31,9 @@ MIN_SIDE, MAX_SIDE = 16, 4096
 """Pixels, of the video that comes in."""
 STORED_SIDE = 640
 """Pixels, of the longer side of what is stored: more than a clip ever shows."""
+_FEW_A_SECOND = 19.5
+_SMALL_SIDE = 120
+"""Pixels, of the shorter side of what is stored."""
 _BROKEN = 0.1
 """Share of pictures that cannot be decoded from which on a video is refused."""
 _LITTLE_REST = 0.5
@@ -105,6 +108,26 @@ class SourceWatch:
                 f"a demo lasts at least {MIN_SECONDS:g} s, as long as a clip, and {self._name} gives "
                 f"{count / fps:.2f} s between --start and --end"
             )
+
+    def warnings(self, width: int, height: int) -> list[str]:
+        """What a person should know of a video that can be used, in sentences.
+
+        Args:
+            width: Of what is stored, pixels.
+            height: Of it.
+        """
+        source, found = self._source, []
+        if source.broken:
+            found.append(f"{source.broken} of {self._seen + source.broken} frames cannot be decoded; the one "
+                         "before each is shown in its place")  # fmt: skip
+        if source.missing:
+            found.append("the file is cut off before its end; what can be read is used")
+        rate = self._used / max(1e-9, min(self._seconds, self._end or math.inf) - self._start)
+        if rate < _FEW_A_SECOND:
+            found.append(f"it has {rate:.0f} frames a second; fast moves can be seen better with 24 or more")
+        if min(width, height) < _SMALL_SIDE:
+            found.append(f"the picture is only {width} x {height} pixels; details will be hard to see")
+        return found
 
     def _period(self, seconds: float) -> float:
         """How long a picture stays of which the container does not say it: as long as those before."""

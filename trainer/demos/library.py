@@ -18,9 +18,10 @@ import logging
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing
-from dataclasses import replace
+from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,8 @@ from onedemo.core.names import check_name, check_new_name
 from onedemo.demos.containers import check_file
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.import_checks import StoredCheck, check_options
-from onedemo.demos.sandboxed_decoder import Limits, Options, decode
-from onedemo.demos.video import VideoReader, write_webm
+from onedemo.demos.sandboxed_decoder import DECODING, Limits, Options, decode
+from onedemo.demos.video import VideoReader, jpeg, write_webm
 from onedemo.errors import UserError
 from onedemo.types import Demo
 
@@ -58,6 +59,7 @@ def import_video(
     task: str = "",
     source: str = "",
     limits: Limits | None = None,
+    warn: Callable[[str], object] = lambda _: None,
 ) -> Demo:
     """Brings a video in as a demo: trimmed, cropped, at a fixed rate, at most 640 px long.
 
@@ -75,6 +77,7 @@ def import_video(
         task: The hand-coded reward that describes the move, if known.
         source: Where the video is from; its file name if empty.
         limits: What decoding it may take; the defaults if None.
+        warn: Called with each sentence about what is not as it should be, though usable.
 
     Returns:
         The demo, stored.
@@ -87,17 +90,8 @@ def import_video(
     check_options(start=start, end=end, crop=crop, fps=fps)
     check_file(path)
     options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)
-    origin = {
-        "source_sha256": _sha256(path),
-        "options": {
-            "start": start,
-            "end": end,
-            "crop": list(crop) if crop else None,
-            "mirror": mirror,
-            "fps": fps,
-        },
-    }
     stored = list(_load_all(demos_dir))
+    origin = _origin(path, options)
     for demo, about in stored:
         if {key: about.get(key) for key in origin} == origin:
             return demo
@@ -108,27 +102,106 @@ def import_video(
     except OSError as error:
         raise UserError(f"cannot store demos in {demos_dir}: {error.strerror}") from error
     with place as workshop:
-        video = workshop / _VIDEO
-        check, pictures = StoredCheck(), hashlib.sha256(f"{fps:g}".encode())
-        with closing(decode(path, options, limits)) as frames:
-            count = write_webm(video, _noting(frames, check, pictures), fps=fps)
-        check.check_pictures(str(path))
-        with VideoReader(video) as reader:
-            for frame in reader.frames():
-                check.stored(frame)
-        about = _describe(
-            workshop / _ABOUT,
-            video,
-            name=name,
-            sha256=pictures.hexdigest(),
-            video_sha256=_sha256(video),
-            fps=fps,
-            frames=count,
-            task=task,
-            source=source or os.fsencode(path.name).decode("utf-8", "replace"),
-            **origin,
-        )
-        return _keep(workshop, about, demos_dir)
+        source = source or os.fsencode(path.name).decode("utf-8", "replace")
+        prepare_demo(path, options, workshop, task=task, source=source, limits=limits, warn=warn)
+        return keep_demo(workshop, name, demos_dir)
+
+
+def prepare_demo(
+    path: Path,
+    options: Options,
+    place: Path,
+    *,
+    task: str = "",
+    source: str,
+    limits: Limits | None = None,
+    warn: Callable[[str], object] = lambda _: None,
+) -> Demo:
+    """Brings a video in as a demo that is not kept yet, nor named: its files are in ``place`` afterwards.
+
+    Args:
+        path: The video; ``check_file`` and ``check_options`` have found nothing wrong.
+        options: Which part of it, and how.
+        place: An empty directory on the file system of the library.
+        task: The hand-coded reward that describes the move, if known.
+        source: Where the video is from.
+        limits: What decoding it may take; the defaults if None.
+        warn: Called with each sentence about what is not as it should be, though usable.
+
+    Returns:
+        The demo, without a name.
+
+    Raises:
+        UserError: If the video is unusable.
+    """
+    video = place / _VIDEO
+    check, pictures = StoredCheck(), hashlib.sha256(f"{options.fps:g}".encode())
+    with closing(decode(path, options, limits, warn)) as frames:
+        count = write_webm(video, _noting(frames, check, pictures), fps=options.fps)
+    check.check_pictures(str(path))
+    with VideoReader(video) as reader:
+        for frame in reader.frames():
+            check.stored(frame)
+    about = _describe(
+        place / _ABOUT,
+        video,
+        name="",
+        sha256=pictures.hexdigest(),
+        video_sha256=_sha256(video),
+        fps=options.fps,
+        frames=count,
+        task=task,
+        source=source,
+        **_origin(path, options),
+    )
+    return _demo(about, video)
+
+
+def keep_demo(place: Path, name: str, demos_dir: Path) -> Demo:
+    """Makes what was prepared a demo; gives the one there is if it has the same pictures.
+
+    Args:
+        place: What ``prepare_demo`` has filled; it is gone afterwards unless the demo was known.
+        name: What to call it.
+        demos_dir: Where demos are kept; made if missing.
+
+    Raises:
+        UserError: If the name is not allowed or taken.
+    """
+    check_new_name(check_name(name))
+    make_directory(demos_dir, private=True)
+    about = json.loads((place / _ABOUT).read_bytes()) | {"name": name}
+    with _names(demos_dir):  # somebody else may have added one meanwhile
+        if known := known_demo(about["sha256"], demos_dir):
+            return known
+        _check_free(name, list_demos(demos_dir))
+        write_atomic(place / _ABOUT, json.dumps(about, indent=1).encode() + b"\n")
+        final = demos_dir / about["sha256"]
+        shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
+        os.replace(place, final)
+        sync_directory(demos_dir)
+    return _demo(about, final / _VIDEO)
+
+
+def known_demo(sha256: str, demos_dir: Path) -> Demo | None:
+    """The demo of these pictures, whatever it is called; None if there is none."""
+    return next((demo for demo in list_demos(demos_dir) if demo.sha256 == sha256), None)
+
+
+def demo_picture(demo: Demo, width: int = 320) -> bytes:
+    """A frame from the middle of a demo as JPEG, that wide.
+
+    Raises:
+        UserError: If the stored file is missing or damaged.
+    """
+    middle = next(islice(stream_frames(demo), demo.frames // 2, None))
+    return jpeg(middle, width)
+
+
+def _origin(path: Path, options: Options) -> dict[str, Any]:
+    """What a demo was made of, and how: of the same, the frames are the same and need not be decoded."""
+    wanted = asdict(options) | {"crop": list(options.crop) if options.crop else None}
+    return {"source_sha256": _sha256(path), "options": wanted, "decoding": DECODING}
 
 
 def remove_demo(demo: Demo, demos_dir: Path) -> None:
@@ -310,21 +383,6 @@ def _noting(
             pictures.update(str(frame.shape).encode())
         pictures.update(frame.data)
         yield check.given(frame)
-
-
-def _keep(workshop: Path, about: dict[str, Any], demos_dir: Path) -> Demo:
-    """Makes what was brought in a demo; gives the one there is if it has the same pictures."""
-    with _names(demos_dir):  # somebody else may have added one meanwhile
-        there = list_demos(demos_dir)
-        for demo in there:
-            if demo.sha256 == about["sha256"]:
-                return demo
-        _check_free(about["name"], there)
-        final = demos_dir / about["sha256"]
-        shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
-        os.replace(workshop, final)
-        sync_directory(demos_dir)
-    return _demo(about, final / _VIDEO)
 
 
 def _names(demos_dir: Path) -> AbstractContextManager[None]:

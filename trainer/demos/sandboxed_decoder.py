@@ -6,7 +6,8 @@ again here. The child (``onedemo.demos.decoder_child``) is given the open file, 
 libraries it can open no other. It is a limited process, not a sandbox: it still runs as the same user.
 
 What comes through the pipe: ``S`` with width and height, then ``F`` with the pixels of one frame, any
-number of times, then ``D``; or at any time ``E`` and a sentence.
+number of times, then ``W`` with a warning, at most a few times, then ``D``; or at any time ``E`` and a
+sentence. Before ``S`` comes ``L``, with what the file is, if a look was asked for; then there is one frame.
 
 Shapes: H rows, W columns; frames are uint8 RGB.
 """
@@ -24,7 +25,7 @@ import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,12 @@ from onedemo.demos.containers import CONVERT
 from onedemo.demos.import_checks import MAX_SECONDS, STORED_SIDE
 from onedemo.errors import UserError
 
+DECODING = 2
+"""Counted up whenever the same file with the same options gives other frames than before."""
 SIZE = struct.Struct("<HH")
+LOOK = struct.Struct("<HHdd")
+LENGTH = struct.Struct("<H")
+_MOST_WARNINGS = 8
 MAX_SENTENCE = 2000
 """Bytes of a complaint that are read."""
 _LIBRARIES = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
@@ -80,13 +86,52 @@ class Options:
         return math.ceil((MAX_SECONDS + 3) * self.fps) + 2
 
 
-def decode(path: Path, options: Options, limits: Limits | None = None) -> Generator[np.ndarray, None, None]:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Look:
+    """What a video of unknown origin is, before anything of it is chosen."""
+
+    width: int
+    """Pixels, upright and square."""
+    height: int
+    """Pixels."""
+    seconds: float
+    """By the container's word; 0 where it does not say."""
+    fps: float
+    """Frames per second, by its word."""
+    picture: np.ndarray
+    """The frame at the moment that was asked for, (H, W, 3), uint8 RGB, at most 640 px long."""
+
+
+def look(path: Path, *, at: float = 0.0, limits: Limits | None = None) -> Look:
+    """Looks at one frame of a video, and at what its container says; as ``decode``.
+
+    Args:
+        path: The file; nothing about it is trusted.
+        at: Moment of the frame, seconds; past the end it is the last one.
+        limits: As ``decode``.
+
+    Raises:
+        UserError: As ``decode``.
+    """
+    said: list[Any] = []
+    frames = list(_run_child(path, Options(start=at), limits, look=True, note=said.append))
+    if len(frames) != 1 or not said or not isinstance(said[0], tuple):
+        raise UserError(f"{path} cannot be decoded; a plain video may help: {CONVERT}")
+    width, height, seconds, fps = said[0]
+    seconds = seconds if math.isfinite(seconds) and 0 <= seconds < 1e7 else 0.0
+    return Look(width=width, height=height, seconds=seconds, fps=fps, picture=frames[0])
+
+
+def decode(
+    path: Path, options: Options, limits: Limits | None = None, warn: Callable[[str], object] = lambda _: None
+) -> Generator[np.ndarray, None, None]:
     """The frames of a video as they are to be stored, decoded by a child that is ended with the iterator.
 
     Args:
         path: The file; nothing about it is trusted.
         options: The part that is wanted.
         limits: What the child may take; the defaults if None.
+        warn: Called with each sentence about what is not as it should be, though usable, before the end.
 
     Yields:
         Frames at the rate wanted, (H, W, 3), uint8 RGB, all of one even size, at most 640 px long.
@@ -94,6 +139,14 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
     Raises:
         UserError: If it is no usable video, or takes more than it may; frames may have come before.
     """
+    return _run_child(path, options, limits, note=lambda said: warn(said) if isinstance(said, str) else None)
+
+
+def _run_child(
+    path: Path, options: Options, limits: Limits | None, *, look: bool = False,
+    note: Callable[[Any], object],
+) -> Generator[np.ndarray, None, None]:  # fmt: skip
+    """The frames that a child sends; what it says besides, a tuple or a sentence, is given to ``note``."""
     limits = limits or Limits()
     if importlib.util.find_spec("resource") is None:
         raise UserError(
@@ -101,7 +154,7 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
             "(on Windows: in WSL 2)"
         )
     root = str(Path(__file__).resolve().parents[2])
-    told = json.dumps([str(path), _plain(options), limits.memory, limits.cpu_seconds])
+    told = json.dumps([str(path), _plain(options), limits.memory, limits.cpu_seconds, look])
     surroundings = {name: os.environ[name] for name in _LIBRARIES if name in os.environ}
     complaints, complaining = os.pipe()
     os.set_blocking(complaints, False)
@@ -137,7 +190,7 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
     timer.start()
     assert child.stdout is not None
     try:
-        whole = yield from _receive(path, child.stdout, options)
+        whole = yield from _receive(child.stdout, options, note)
         if not whole:
             child.stdout.close()  # or it may wait for ever to be read
             with suppress(subprocess.TimeoutExpired):
@@ -151,12 +204,20 @@ def decode(path: Path, options: Options, limits: Limits | None = None) -> Genera
         os.close(complaints)
 
 
-def _receive(path: Path, pipe: IO[bytes], options: Options) -> Generator[np.ndarray, None, bool]:
+def _receive(
+    pipe: IO[bytes], options: Options, note: Callable[[Any], object]
+) -> Generator[np.ndarray, None, bool]:
     """Yields what the child sends as long as it keeps to the agreement; returns whether it was whole."""
-    size = None
-    for count in range(options.most_frames + 2):
+    size, warnings = None, 0
+    for _ in range(options.most_frames + 3 + _MOST_WARNINGS):
         tag = pipe.read(1)
-        if tag == b"S" and count == 0:
+        if tag == b"L" and size is None:
+            note(LOOK.unpack(pipe.read(LOOK.size).ljust(LOOK.size, b"\0")))
+        elif tag == b"W" and size and warnings < _MOST_WARNINGS:
+            warnings += 1
+            (length,) = LENGTH.unpack(pipe.read(LENGTH.size).ljust(LENGTH.size, b"\0"))
+            note(_printable(pipe.read(min(length, MAX_SENTENCE))))
+        elif tag == b"S" and size is None:
             width, height = SIZE.unpack(pipe.read(SIZE.size).ljust(SIZE.size, b"\0"))
             if not (2 <= width <= STORED_SIDE and 2 <= height <= STORED_SIDE) or width % 2 or height % 2:
                 return False
@@ -167,11 +228,14 @@ def _receive(path: Path, pipe: IO[bytes], options: Options) -> Generator[np.ndar
                 return False
             yield np.frombuffer(pixels, np.uint8).reshape(size)
         elif tag == b"E":
-            sentence = pipe.read(MAX_SENTENCE).decode("utf-8", "replace")
-            raise UserError("".join(c if c.isprintable() else " " for c in sentence).strip())
+            raise UserError(_printable(pipe.read(MAX_SENTENCE)))
         else:
             return tag == b"D" and size is not None
     return False
+
+
+def _printable(sentence: bytes) -> str:
+    return "".join(c if c.isprintable() else " " for c in sentence.decode("utf-8", "replace")).strip()
 
 
 def _last_line(complaints: int) -> str:

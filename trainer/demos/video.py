@@ -121,6 +121,15 @@ def write_webm(path: Path, frames: Iterable[np.ndarray], *, fps: float) -> int:
     return written
 
 
+def jpeg(picture: np.ndarray, width: int | None = None) -> bytes:
+    """A picture, (H, W, 3) uint8 RGB, as JPEG: as it is, or scaled to a width in pixels."""
+    if width is not None:
+        size = (width, max(1, round(picture.shape[0] * width / picture.shape[1])))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()
+
+
 def count_frames(path: Path) -> int:
     """Decodes a video and counts its frames.
 

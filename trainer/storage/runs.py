@@ -8,6 +8,11 @@ import sqlite3
 from onedemo.errors import UserError
 from onedemo.storage.database import Database, now
 
+_COLUMNS = (
+    "id", "demo", "demo_sha256", "seed", "config", "version", "created_at", "step_seconds", "title", "note",
+)  # fmt: skip
+_OF_A_RUN = ("tallies", "clips", "pairs", "iterations", "snapshots")
+
 
 class Runs:
     """Runs, their snapshots and their iterations."""
@@ -17,7 +22,7 @@ class Runs:
 
     def add(
         self, *, run: str, demo: str, demo_sha256: str, seed: int, config: str, version: str,
-        step_seconds: float = 0.008, created_at: str | None = None,
+        step_seconds: float = 0.008, created_at: str | None = None, title: str = "", note: str = "",
     ) -> None:  # fmt: skip
         """Records a new run.
 
@@ -30,6 +35,8 @@ class Runs:
             version: Of the program that made it.
             step_seconds: Length of its robot's control step.
             created_at: When it was made, if not now.
+            title: What people call it, if not by its name.
+            note: What they say of it.
 
         Raises:
             UserError: If a run of that name exists.
@@ -37,19 +44,56 @@ class Runs:
         with self._database.transaction() as db:
             try:
                 db.execute(
-                    "INSERT INTO runs"
-                    " (id, demo, demo_sha256, seed, config, version, created_at, step_seconds)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                    (run, demo, demo_sha256, seed, config, version, created_at or now(), step_seconds),
+                    f"INSERT INTO runs ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))})",
+                    (
+                        run,
+                        demo,
+                        demo_sha256,
+                        seed,
+                        config,
+                        version,
+                        created_at or now(),
+                        step_seconds,
+                        title,
+                        note,
+                    ),
                 )
             except sqlite3.IntegrityError:
                 raise UserError(f"run {run!r} exists already; choose another name") from None
 
     def all(self) -> list[dict]:
-        """All runs, oldest first: id, demo, demo_sha256, seed, config, version, created_at, step_seconds."""
-        names = ("id", "demo", "demo_sha256", "seed", "config", "version", "created_at", "step_seconds")
-        rows = self._database.rows(f"SELECT {', '.join(names)} FROM runs ORDER BY rowid")
-        return [dict(zip(names, row, strict=True)) for row in rows]
+        """All runs, oldest first, each {id, demo, demo_sha256, ...}: the arguments of ``add``."""
+        rows = self._database.rows(f"SELECT {', '.join(_COLUMNS)} FROM runs ORDER BY rowid")
+        return [dict(zip(_COLUMNS, row, strict=True)) for row in rows]
+
+    def describe(self, run: str, *, title: str, note: str) -> None:
+        """Notes what people call a run and say of it; "" for nothing."""
+        with self._database.transaction() as db:
+            db.execute("UPDATE runs SET title = ?, note = ? WHERE id = ?", (title, note, run))
+
+    def delete(self, run: str) -> None:
+        """Deletes a run with its clips and pairs, and all that people said of them: there is no way back.
+
+        Events are append-only by triggers; they are taken away in this one transaction and put back.
+        """
+        clips, pairs = (f"(SELECT id FROM {table} WHERE run = :run)" for table in ("clips", "pairs"))
+        with self._database.transaction() as db:
+            guards = db.execute(
+                "SELECT name, sql FROM sqlite_master WHERE type = 'trigger' AND name LIKE '%_keep_delete'"
+                " AND tbl_name IN ('events', 'comparisons')"
+            ).fetchall()
+            for name, _ in guards:
+                db.execute(f"DROP TRIGGER {name}")
+            for table, which in (
+                ("events", f"run = :run OR clip_id IN {clips}"),
+                ("comparisons", f"pair_id IN {pairs}"),
+                ("segments", f"clip_id IN {clips}"),
+                *((table, "run = :run") for table in _OF_A_RUN),
+                ("runs", "id = :run"),
+            ):
+                db.execute(f"DELETE FROM {table} WHERE {which}", {"run": run})
+            for _, guard in guards:
+                db.execute(guard)
 
     def rename_demo(self, demo_sha256: str, name: str) -> None:
         """Gives the demo of some runs the name that it has from now on."""

@@ -277,6 +277,11 @@ STEPS: dict[int, str] = {
     );
     CREATE INDEX run_marks_by_run ON run_marks (run, id);
     """,
+    # 9: what people call a run and say of it; its name (id) stays, as that of its directory and in exports.
+    9: """
+    ALTER TABLE runs ADD COLUMN title TEXT NOT NULL DEFAULT '';
+    ALTER TABLE runs ADD COLUMN note TEXT NOT NULL DEFAULT '';
+    """,
 }
 
 

@@ -1,0 +1,53 @@
+// Addresses of tabs: /r/N/data is the tab Data of N's page, /r/N/ the first one. Back, reload and a link lead
+// there, and the window is called after the tab and the run.
+//
+// Not a module: it must have run before Viser, which begins while the page is still being read.
+(() => {
+  "use strict";
+  const { viserKey } = page; // static/page.js
+
+  // Viser writes its server into the address bar when the page has a path; here that is always ours.
+  const replaceState = history.replaceState.bind(history);
+  history.replaceState = (state, title) => replaceState(state, title, location.pathname);
+  if (location.hash) history.replaceState(null, ""); // it would become part of the address of Viser's socket
+
+  // Viser's palette of commands: nothing in it is for people. The browser's own key is left alone.
+  window.addEventListener(
+    "keydown",
+    (event) => {
+      if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "k") event.stopImmediatePropagation();
+    },
+    true,
+  );
+
+  // The button of the tab that the address names.
+  function named() {
+    const tab = location.pathname.split("/").at(-1);
+    return document.querySelector(tab ? `.od-tabs [data-tab="${CSS.escape(tab)}"]` : ".od-tabs button");
+  }
+
+  // Asks for that tab until it is there: Viser listens to its key a moment after the header is drawn.
+  async function follow() {
+    for (let tries = 0; tries < 10; tries += 1) {
+      const button = named();
+      if (!button || button.matches("[aria-current]")) return;
+      viserKey(button.dataset.key);
+      await new Promise((go) => setTimeout(go, 500));
+    }
+  }
+
+  let before = {};
+  function look() {
+    const header = document.querySelector(".od-header");
+    const { page: name, tab } = header?.dataset ?? {};
+    if (!header || (name === before.page && tab === before.tab)) return;
+    const came = name !== before.page; // Viser connected, it may be anew: with the tab that it began with
+    before = { page: name, tab };
+    document.title = `${header.dataset.title} - onedemo`;
+    if (named()?.dataset.tab === tab) return;
+    if (came) follow();
+    else history.pushState(null, "", tab);
+  }
+  new MutationObserver(look).observe(document.documentElement, { childList: true, subtree: true });
+  window.addEventListener("popstate", follow);
+})();
