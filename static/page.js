@@ -6,7 +6,7 @@
 // Not a module: it must have run before Viser, which begins while the page is still being read.
 const page = (() => {
   "use strict";
-  const { forget, main, toggleSlow, watchPlayers } = clips; // static/player.js
+  const { forget, main, toggleSlow, toggleTrail, watchPlayers } = clips; // static/player.js
   const { answers, settings } = line; // static/line.js
 
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
@@ -213,6 +213,7 @@ const page = (() => {
     else if (!player) return false;
     else if (key === " ") player.replay();
     else if (key === "f" || key === "F") toggleSlow();
+    else if (key === "t" || key === "T") toggleTrail();
     else if (key === "ArrowLeft") player.seek(player.frame - 1);
     else if (key === "ArrowRight") player.seek(player.frame + 1);
     else if ((key === "m" || key === "M") && player.clip) player.markByKey();
@@ -279,6 +280,7 @@ const page = (() => {
     else if (data.key) answer(data.key);
     else if ("replay" in data) local(" ");
     else if ("slow" in data) local("f");
+    else if ("trail" in data) local("t");
     else if ("step" in data) local(data.step === "1" ? "ArrowRight" : "ArrowLeft");
     else if ("mark" in data) local("m");
     else if ("help" in data) local("?");

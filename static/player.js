@@ -3,36 +3,52 @@
 // data-src is a player; elements come and go as the server redraws the page.
 const clips = (() => {
   "use strict";
-  const HEIGHT = 360;
-  const LEFT = { both: 0, left: 0, right: 492, third: 984 };
-  const WIDTH = { false: 972, true: 1464 }; // of a moment: video and one robot, or two
-  const HOLD_S = 0.5; // the last frame stays so long before the clip starts over
+  const { drawPace, drawSide } = drawing; // static/drawing.js
+  const SIDES = { left: [0], right: [1], third: [2], both: [0, 1] };
+  const PACES = [1, 0.5]; // real time, then half of it, in turn
   const SLOW = 0.25;
-  const KEPT = 8; // pictures kept in memory, decoded: up to 17 MB each
+  const BEAT_S = 0.12; // the last frame stays so long, so that the jump back can be told from the movement
+  const LABELS_S = [5, 6.5]; // what head and foot are is said so long, and then fades
+  const KEPT = 6; // pictures kept in memory, decoded: up to 31 MB each
 
   const still = window.matchMedia("(prefers-reduced-motion: reduce)");
   const pictures = new Map();
   const players = new Map();
   const marks = new Map(); // of clips that are not answered yet: another tab takes them off the page
-  let slow = false;
+  const chosen = (name) => localStorage.getItem(`onedemo-${name}`) === "on";
+  let slow = chosen("slow");
+  let trail = chosen("trail"); // first pose, and the paths of head and foot
 
   // A bitmap stays decoded; an element's picture may have to be decoded again when it is drawn.
   async function decoded(source) {
     const answer = await fetch(source);
     if (!answer.ok) throw new Error(`${source}: ${answer.status}`);
-    return createImageBitmap(await answer.blob());
+    const blob = await answer.blob();
+    const about = noted(new DataView(await blob.slice(0, 1 << 19).arrayBuffer()));
+    return { image: await createImageBitmap(blob), about };
+  }
+
+  // What is written in the comments of a clip's file, in the order in which they stand.
+  function noted(bytes) {
+    const words = new TextDecoder();
+    let text = "";
+    for (let at = 2; bytes.getUint16(at) !== 0xffda; at += 2 + bytes.getUint16(at + 2)) {
+      if (bytes.getUint16(at) !== 0xfffe) continue;
+      const note = words.decode(new Uint8Array(bytes.buffer, at + 4, bytes.getUint16(at + 2) - 2));
+      if (note.startsWith("onedemo clip ")) text += note.slice(13);
+    }
+    return JSON.parse(text);
   }
 
   function picture(source) {
     let entry = pictures.get(source);
     if (entry) return entry;
-    entry = { image: null, ready: false };
+    entry = { image: null, about: null, ready: false };
     pictures.set(source, entry);
     if (pictures.size > KEPT) pictures.delete(pictures.keys().next().value);
     decoded(source).then(
-      (image) => {
-        entry.image = image;
-        entry.ready = true;
+      (found) => {
+        Object.assign(entry, found, { ready: true });
         for (const player of players.values()) if (player.source === source) player.draw();
         wake();
       },
@@ -52,15 +68,18 @@ const clips = (() => {
       this.clip = Number(element.dataset.clip) || null;
       this.canvases = [...element.querySelectorAll("canvas")];
       this.box = element.parentElement;
-      this.width = WIDTH["pair" in element.dataset];
+      this.hint = element.querySelector(".od-hint");
       this.time = 0;
+      this.pass = 0;
       this.playing = !still.matches;
       this.once = false;
       this.mark = null; // [first frame, frame after the last]
       this.marking = null; // frame at which a mark by key began
       this.answered = false;
-      this.drawn = -1;
+      this.drawn = "";
+      this.seen = 0; // seconds since it was on screen
       picture(this.source);
+      this.canvases.forEach(fit);
       const before = element.dataset.mark?.split(",").map(Number); // as it was when it was taken back
       const mark = marks.has(this.clip) ? marks.get(this.clip) : before;
       if (mark) this.setMark(mark);
@@ -73,11 +92,8 @@ const clips = (() => {
     get ready() {
       return this.entry.ready;
     }
-    get columns() {
-      return Math.round(this.entry.image.width / this.width);
-    }
     get frames() {
-      return this.ready ? this.columns * Math.round(this.entry.image.height / HEIGHT) : 1;
+      return this.ready ? this.entry.about.frames : 1;
     }
     get frame() {
       return Math.min(this.frames - 1, Math.floor(this.time * this.fps + 1e-6));
@@ -85,28 +101,61 @@ const clips = (() => {
 
     draw() {
       if (!this.ready) return;
-      const frame = this.frame;
+      const { frame, labels } = this;
+      const pace = `${this.pace}`;
+      const what = [frame, pace, labels, trail, this.playing, ...this.canvases.map((c) => c.width * c.height)].join();
+      if (what === this.drawn) return;
+      this.drawn = what;
       if (this.box && this.clip) this.drawBar();
-      if (frame === this.drawn) return;
-      this.drawn = frame;
-      const y = Math.floor(frame / this.columns) * HEIGHT;
-      const x = (frame % this.columns) * this.width;
+      if (this.hint) this.hint.hidden = this.playing || !this.isMain;
+      const { image, about } = this.entry;
       for (const canvas of this.canvases) {
-        const { width, height } = canvas;
-        canvas
-          .getContext("2d")
-          .drawImage(this.entry.image, x + LEFT[canvas.dataset.side], y, width, height, 0, 0, width, height);
+        const pen = canvas.getContext("2d");
+        const sides = SIDES[canvas.dataset.side];
+        const gap = sides.length > 1 ? Math.round(canvas.width * 0.012) : 0;
+        const width = (canvas.width - gap * (sides.length - 1)) / sides.length;
+        pen.clearRect(0, 0, canvas.width, canvas.height);
+        sides.forEach((side, index) => {
+          pen.save();
+          pen.translate(index * (width + gap), 0);
+          pen.beginPath();
+          pen.rect(0, 0, width, canvas.height);
+          pen.clip();
+          const { height } = canvas;
+          const place = { pen, width, height, unit: height / (canvas.clientHeight || 360) };
+          drawSide(place, image, about, about.sides[side], frame, { trail, labels });
+          if (side === 0 && this.playing && this.isMain) drawPace(place, pace);
+          pen.restore();
+        });
       }
       this.element.dataset.frame = frame;
+      this.element.dataset.pace = pace;
+    }
+
+    // How plainly head and foot are named: in the first practice clip, for some seconds.
+    get labels() {
+      if (this.element.dataset.exercise !== "0") return 0;
+      const [from, to] = LABELS_S;
+      return still.matches ? 1 : Math.max(0, Math.min(1, (to - this.seen) / (to - from)));
+    }
+
+    get pace() {
+      return slow && this.isMain ? SLOW : this.once ? 1 : PACES[this.pass % PACES.length];
     }
 
     advance(seconds) {
-      if (!this.playing || !this.ready) return;
-      const length = this.frames / this.fps;
-      this.time += seconds * (slow && this.isMain ? SLOW : 1);
-      if (this.time >= length + HOLD_S || (this.once && this.time >= length)) {
-        if (this.once) this.playing = this.once = false;
-        this.time = this.playing ? 0 : length;
+      if (!this.ready) return;
+      this.seen += seconds;
+      if (this.playing) {
+        const length = this.frames / this.fps;
+        this.time += seconds * this.pace;
+        if (this.once && this.time >= length) {
+          this.playing = this.once = false;
+          this.time = length;
+        } else if (this.time >= length + BEAT_S * this.pace) {
+          this.time = 0;
+          this.pass += 1;
+        }
       }
       this.draw();
     }
@@ -116,7 +165,7 @@ const clips = (() => {
     }
 
     replay() {
-      this.time = 0;
+      this.time = this.pass = 0;
       this.playing = true;
       this.once = still.matches;
       this.draw();
@@ -178,6 +227,18 @@ const clips = (() => {
     }
   }
 
+  // Gives a canvas the pixels of the screen that it covers.
+  function fit(canvas) {
+    const by = window.devicePixelRatio;
+    const width = Math.round((canvas.clientWidth || 480) * by);
+    const height = Math.round((canvas.clientHeight || 360) * by);
+    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+  }
+  const sizes = new ResizeObserver((changes) => {
+    for (const { target } of changes) fit(target);
+    for (const player of players.values()) player.draw();
+  });
+
   let last = 0;
   let running = false;
   function tick(now) {
@@ -186,7 +247,7 @@ const clips = (() => {
     let any = false;
     for (const player of players.values()) {
       player.advance(seconds);
-      any ||= player.playing;
+      any ||= player.playing || (player.labels > 0 && !still.matches);
     }
     running = any;
     if (any) requestAnimationFrame(tick);
@@ -204,12 +265,14 @@ const clips = (() => {
       const known = players.get(element);
       if (known && known.source === element.dataset.src) continue;
       players.set(element, new Player(element));
+      for (const canvas of element.querySelectorAll("canvas")) sizes.observe(canvas);
       wake();
     }
     for (const element of document.querySelectorAll("[data-ahead]")) picture(element.dataset.ahead);
-    const slowButton = document.querySelector("[data-slow]");
-    if (slowButton && slowButton.getAttribute("aria-pressed") !== String(slow))
-      slowButton.setAttribute("aria-pressed", slow);
+    for (const [name, on] of [["slow", slow], ["trail", trail]]) {
+      const button = document.querySelector(`[data-${name}]`);
+      if (button && button.getAttribute("aria-pressed") !== String(on)) button.setAttribute("aria-pressed", on);
+    }
   }
 
   function watchPlayers() {
@@ -223,15 +286,19 @@ const clips = (() => {
     return element ? (players.get(element) ?? null) : null;
   }
 
-  function toggleSlow() {
-    slow = !slow;
+  // What stays as it was chosen, after a reload too.
+  function choose(name, on) {
+    localStorage.setItem(`onedemo-${name}`, on ? "on" : "off");
     look();
+    for (const player of players.values()) player.draw();
   }
+  const toggleSlow = () => choose("slow", (slow = !slow));
+  const toggleTrail = () => choose("trail", (trail = !trail));
 
   // A clip was answered, with its mark.
   function forget(clip) {
     marks.delete(Number(clip));
   }
 
-  return { forget, main, toggleSlow, watchPlayers };
+  return { forget, main, toggleSlow, toggleTrail, watchPlayers };
 })();

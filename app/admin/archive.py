@@ -30,7 +30,7 @@ _NAMES = re.compile(
             rf"robots/{_FILE}\.npz",
             rf"{_RUN}/(config\.toml|log|start\.pt|checkpoint(-before)?\.pt)",
             rf"{_RUN}/snapshots/\d{{6,15}}\.pt",
-            rf"{_RUN}/(clips|pairs)/\d{{6,15}}\.jpg",
+            rf"{_RUN}/(clips|pairs)/\d{{6,15}}(\.\d{{1,3}})?\.jpg",
             rf"{_RUN}/rollouts/\d{{6,15}}\.(npz|jpg|webm)",
         )
     ),

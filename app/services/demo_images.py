@@ -16,6 +16,9 @@ import numpy as np
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
+from onedemo.render.framing import film_sides
+from onedemo.render.mover import locate
+from onedemo.storage.run_directory import CLIP_FORMAT
 from onedemo.storage.store import Store
 from onedemo.types import Demo
 
@@ -32,7 +35,7 @@ def version_of(store: Store, run: str) -> str:
     Browsers keep pictures for good, and clips of other data at the same address have the same numbers.
     """
     made = next(entry["created_at"] for entry in store.runs.all() if entry["id"] == run)
-    return f"{zlib.crc32(f'{run} {made}'.encode()):08x}"
+    return f"{zlib.crc32(f'{run} {made} {CLIP_FORMAT}'.encode()):08x}"
 
 
 class Pictures:
@@ -84,10 +87,12 @@ class Pictures:
             raise
         length = min(len(frames), max(2, round(_CLIP_SECONDS * self.demo.fps)))
         moments = example_moments(frames, length=length)
+        mover = locate(frames)
         examples = {}
         for name, other in moments.items():
-            start = moments["same"]
-            examples[name] = compose_clip(frames[start : start + length], frames[other : other + length])
+            shown = [np.arange(start, start + length) for start in (moments["same"], other)]
+            movers = [mover and mover.at(some) for some in shown]
+            examples[name] = compose_clip(*film_sides([frames[some] for some in shown], movers))
         self._examples = examples
         self._frames = [_jpeg(frame) for frame in frames]
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from onedemo.app.templates import render
+from onedemo.storage.run_directory import CLIP_FORMAT
 
 
 def example_address(name: str, sha256: str) -> str:
     """Where an example from a demo is; another demo's are elsewhere, as browsers keep them."""
-    return f"demo/examples/{name}.jpg?v={sha256[:8]}"
+    return f"demo/examples/{name}.jpg?v={sha256[:8]}-{CLIP_FORMAT}"
 
 
 def player_html(source: str, fps: float, *sides: str) -> str:

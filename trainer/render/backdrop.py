@@ -41,9 +41,27 @@ class Camera:
     """Vertical field of view, degrees."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Window:
+    """What part of a camera's view a picture shows, and how large."""
+
+    focal: float
+    """Focal length, pixels: a metre at the distance d takes focal / d."""
+    column: float
+    """Where the camera looks at, pixels from the left edge."""
+    row: float
+    """The horizon, pixels from the upper edge; it may lie outside the picture."""
+
+
+def whole_view(height: int, width: int, fovy: float) -> Window:
+    """All that a camera sees, whose field of view fills the height."""
+    return Window(focal=height / 2 / np.tan(np.radians(fovy) / 2), column=width / 2, row=height / 2)
+
+
 def backdrop(
-    width: int, height: int, camera: Camera, limbs_L4: np.ndarray | None = None, *, exact: bool = True
-) -> np.ndarray:
+    width: int, height: int, camera: Camera, limbs_L4: np.ndarray | None = None, *, exact: bool = True,
+    window: Window | None = None,
+) -> np.ndarray:  # fmt: skip
     """Draws sky, floor and the shadow of the limbs.
 
     Args:
@@ -53,11 +71,15 @@ def backdrop(
         limbs_L4: Per limb its extent in x (low, high), the height of its lowest point and its
             radius, all in metres, (L, 4); None for an empty floor.
         exact: Computes in doubles; else in half the time, with some pixels a grey level off.
+        window: The part of the camera's view that fills the picture; all of it if None.
 
     Returns:
         The picture, (H, W, 3), uint8 RGB.
     """
-    ground = _ground(width, height, camera.z, camera.distance, camera.fovy, exact)
+    window = window or whole_view(height, width, camera.fovy)
+    ground = _ground(width, height, camera.z, camera.distance, camera.fovy, window, exact)
+    if ground.horizon == height:
+        return cv2.merge(ground.sky)
     x_hW1 = ground.x_hW1 + np.float32(camera.x)
     light_hW = _wave(x_hW1)
     light_hW /= ground.pixel_h1
@@ -79,7 +101,7 @@ def backdrop(
             rows = floor[ground.near]
             rows += clear * (SHADOW[colour] - rows)
         floor += 0.5
-        plane[height // 2 :] = floor
+        plane[ground.horizon :] = floor
         planes.append(plane)
     return cv2.merge(planes)
 
@@ -88,6 +110,8 @@ def backdrop(
 class _Ground:
     """What all pictures from one height have in common, whatever the camera passes."""
 
+    horizon: int
+    """The first row of the floor; the height of the picture if it shows none."""
     sky: list[np.ndarray]
     """Whole pictures, a plane each of red, green and blue, (H, W), uint8."""
     y_h: np.ndarray
@@ -107,18 +131,23 @@ class _Ground:
 
 
 @lru_cache(8)
-def _ground(width: int, height: int, z: float, distance: float, fovy: float, exact: bool) -> _Ground:
-    """The camera keeps its height but for jumps, so this is hardly ever computed."""
-    focal = height / 2 / np.tan(np.radians(fovy) / 2)
-    horizon = height // 2
+def _ground(
+    width: int, height: int, z: float, distance: float, fovy: float, window: Window, exact: bool
+) -> _Ground:
+    """The camera keeps its height but for jumps, so this is computed once a clip."""
+    focal = window.focal
+    horizon = int(np.clip(np.ceil(window.row - 0.5), 0, height))
     sky = np.zeros((height, width, 3), np.uint8)
-    sky[:horizon] = (_sky(horizon)[:, None] + 0.5).astype(np.uint8)
+    above = _sky(round(focal * np.tan(np.radians(fovy) / 2)))
+    rows = np.arange(horizon) - int(np.ceil(window.row - 0.5)) + len(above)
+    sky[:horizon] = (above[np.clip(rows, 0, len(above) - 1), None] + 0.5).astype(np.uint8)
 
-    slope_h = (np.arange(horizon, height, dtype=np.float32) + 0.5 - height / 2) / focal
+    # Half a pixel of the horizon itself would be floor without end.
+    slope_h = np.maximum(np.arange(horizon, height, dtype=np.float32) + 0.5 - window.row, 0.05) / focal
     depth_h = z / slope_h
     y_h = depth_h - distance
     y_size_h = depth_h**2 / (z * focal)
-    edges_W1 = (np.arange(width + 1, dtype=np.float32) - width / 2) / focal
+    edges_W1 = (np.arange(width + 1, dtype=np.float32) - window.column) / focal
     wave_y_h = (_triangle(y_h + y_size_h / 2) - _triangle(y_h - y_size_h / 2)) / y_size_h
 
     # Row by row every colour is a blend of two, so the rest is one multiplication per pixel.
@@ -133,6 +162,7 @@ def _ground(width: int, height: int, z: float, distance: float, fovy: float, exa
     near = np.flatnonzero(np.abs(y_h) < 0.7)
     kind = np.float64 if exact else np.float32
     return _Ground(
+        horizon=horizon,
         sky=[np.ascontiguousarray(sky[:, :, colour]) for colour in range(3)],
         y_h=y_h.astype(kind),
         x_hW1=(depth_h[:, None] * edges_W1).astype(kind),

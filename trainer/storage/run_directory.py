@@ -7,6 +7,10 @@ from pathlib import Path
 
 from onedemo.core.names import LONGEST, check_name
 
+CLIP_FORMAT = 2
+"""How clips are drawn: raised when another page must show them. Those of before are drawn again under another
+name when somebody looks, and deleted as the oldest."""
+
 _LONGEST = LONGEST + 20
 """Characters: a run without a name of its own is called after its demo, with a number behind."""
 
@@ -74,8 +78,8 @@ class RunDirectory:
 
     def clip(self, number: int) -> Path:
         """The picture of a clip, all its frames; it is there once the clip is "ready"."""
-        return self.path / "clips" / f"{number:06d}.jpg"
+        return self.path / "clips" / f"{number:06d}.{CLIP_FORMAT}.jpg"
 
     def pair(self, number: int) -> Path:
         """The picture of a pair; it is there once the pair is "ready"."""
-        return self.path / "pairs" / f"{number:06d}.jpg"
+        return self.path / "pairs" / f"{number:06d}.{CLIP_FORMAT}.jpg"

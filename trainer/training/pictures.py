@@ -24,7 +24,9 @@ from onedemo.core.files import replacing, sealed, write_atomic
 from onedemo.demos.frame_clock import frame_of_step
 from onedemo.demos.library import stream_frames
 from onedemo.demos.video import write_webm
-from onedemo.render.clip_image import compose_clip, fit, side_by_side
+from onedemo.render.clip_image import compose_clip, side_by_side
+from onedemo.render.framing import clip_sides
+from onedemo.render.mover import Mover, locate
 from onedemo.render.renderer import Drawing, Order, Renderer
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
@@ -135,8 +137,9 @@ def draw_clip(
 
     It is not synced: after a power cut its checksum tells that it must be drawn again.
     """
-    pictures = [renderer.render(qpos) for qpos in robots]
-    write_atomic(file, sealed(compose_clip(_fitted(demo)[frames], *pictures)), sync=False)
+    film, mover = _filmed(demo)
+    sides = clip_sides(renderer, film[frames], mover and mover.at(frames), robots)
+    write_atomic(file, sealed(compose_clip(*sides)), sync=False)
 
 
 def draw_strip(renderer: Renderer, *, file: Path, qpos: np.ndarray) -> None:
@@ -173,23 +176,17 @@ def draw_film(
         for some in np.array_split(shown, -(-len(shown) // _AT_ONCE)):
             renderer.between()
             for t, robot in zip(some, renderer.render(qpos[some]), strict=True):
-                yield side_by_side(_fitted(demo)[frames[t]], robot)
+                yield side_by_side(_filmed(demo)[0][frames[t]], robot)
 
     with replacing(file, ".webm", sync=False) as half:
         write_webm(half, pairs(), fps=demo.fps)
 
 
 @lru_cache(1)
-def _fitted(demo: Demo) -> np.ndarray:
-    """The demo's frames at the size of one side, (F, H, W, 3), uint8 RGB: scaled once, not for each clip."""
-    frames: np.ndarray | None = None
-    for number, frame in enumerate(stream_frames(demo)):
-        side = fit(frame)
-        if frames is None:
-            frames = np.empty((demo.frames, *side.shape), np.uint8)
-        frames[number] = side
-    assert frames is not None, "a demo has frames"
-    return frames
+def _filmed(demo: Demo) -> tuple[np.ndarray, Mover | None]:
+    """The demo's pictures, (F, H, W, 3), uint8 RGB, and what moves in them: once, not for each clip."""
+    frames = np.stack(list(stream_frames(demo)))
+    return frames, locate(frames)
 
 
 # What is deleted

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from onedemo.core.files import jpeg_fault, sealed
 from onedemo.render.backdrop import Camera, backdrop
 from onedemo.render.clip_image import (
-    CLIP_HEIGHT,
-    CLIP_WIDTH,
     GAP,
     SIDE_HEIGHT,
     SIDE_WIDTH,
+    Side,
     compose_clip,
     fit,
     frame_durations,
+    read_about,
 )
 
 RED, BLUE = (200, 40, 40), (40, 60, 200)
@@ -34,49 +35,53 @@ def stepping(colour, count=10):
     return frames
 
 
-def decode(data, count):
-    """Frames (k, H, W, 3), in the order in which the page plays them."""
-    picture = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
-    columns = picture.shape[1] // CLIP_WIDTH
-    frames = []
-    for i in range(count):
-        y, x = i // columns * CLIP_HEIGHT, i % columns * CLIP_WIDTH
-        frames.append(picture[y : y + CLIP_HEIGHT, x : x + CLIP_WIDTH])
-    return np.stack(frames)
+def decode(data):
+    """Of each side its frames (k, H, W, 3), in the order in which the page plays them."""
+    picture, about = np.asarray(Image.open(io.BytesIO(data)).convert("RGB")), read_about(data)
+    (width, height), sides = about["cell"], []
+    for side in about["sides"]:
+        wide, tall = side["size"]
+        places = [divmod(i, about["columns"]) for i in range(about["frames"])]
+        corners = [(row * height, column * width + side["at"]) for row, column in places]
+        sides.append(np.stack([picture[y : y + tall, x : x + wide] for y, x in corners]))
+    return sides
 
 
 def test_demo_left_agent_right_white_between():
-    frame = decode(compose_clip(plain(RED), plain(BLUE)), 10)[0].astype(int)
-    assert frame.shape == (CLIP_HEIGHT, CLIP_WIDTH, 3)
-    assert np.abs(frame[180, 200] - RED).max() < 8
-    assert np.abs(frame[180, SIDE_WIDTH + GAP + 200] - BLUE).max() < 8
-    assert frame[180, SIDE_WIDTH + GAP // 2].min() > 245
+    data = compose_clip(plain(RED), plain(BLUE, size=(100, 200)))
+    demo, agent = (side[0].astype(int) for side in decode(data))
+    assert demo.shape == (SIDE_HEIGHT, SIDE_WIDTH, 3) and agent.shape == (100, 200, 3)
+    assert np.abs(demo[180, 200] - RED).max() < 8 and np.abs(agent[50, 100] - BLUE).max() < 8
+    picture = np.asarray(Image.open(io.BytesIO(data)))
+    assert picture[180, SIDE_WIDTH + GAP // 2].min() > 245
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("count", "columns"), [(10, 1), (40, 1), (41, 2), (151, 4)])
+@pytest.mark.parametrize(("count", "columns"), [(10, 1), (44, 1), (45, 2), (151, 4)])
 def test_both_sides_show_the_same_moment_and_no_picture_is_too_high(count, columns):
     def bars(colour):
-        frames = np.full((count, 36, 48, 3), 240, np.uint8)
+        frames = np.full((count, 360, 480, 3), 240, np.uint8)
         for i, frame in enumerate(frames):
-            frame[:, i % 10 * 4 + 3 : i % 10 * 4 + 7] = colour
+            frame[:, i % 10 * 40 + 30 : i % 10 * 40 + 70] = colour
         return frames
 
     data = compose_clip(bars(RED), bars(BLUE))
-    frames = decode(data, count).astype(int)
-    for i, frame in enumerate(frames):
-        red = np.nonzero(frame[180, :, 0] - frame[180, :, 2] > 80)[0].mean()
-        blue = np.nonzero(frame[180, :, 2] - frame[180, :, 0] > 80)[0].mean() - SIDE_WIDTH - GAP
+    for i, (demo, agent) in enumerate(zip(*decode(data), strict=True)):
+        red = np.nonzero(demo[180, :, 0].astype(int) - demo[180, :, 2] > 80)[0].mean()
+        blue = np.nonzero(agent[180, :, 2].astype(int) - agent[180, :, 0] > 80)[0].mean()
         assert abs(red - (50 + 40 * (i % 10))) < 6 and abs(blue - red) < 4
-    width, height = Image.open(io.BytesIO(data)).size
-    assert (width, height) == (columns * CLIP_WIDTH, -(-count // columns) * CLIP_HEIGHT)
-    assert height < 16_384
+    assert read_about(data)["columns"] == columns
+    assert Image.open(io.BytesIO(data)).size[1] < 16_384
 
 
-def test_what_is_left_of_the_grid_shows_the_last_frame():
-    picture = np.asarray(Image.open(io.BytesIO(compose_clip(plain(RED, 41), plain(BLUE, 41)))))
-    assert picture.shape[:2] == (21 * CLIP_HEIGHT, 2 * CLIP_WIDTH)
-    assert np.abs(picture[-180, CLIP_WIDTH + 200].astype(int) - RED).max() < 8
+def test_what_is_known_of_a_side_is_read_again_however_much_it_is():
+    known = {"left": [k / 1000 for k in range(40_000)], "bottom": -0.15}  # more than one comment holds
+    data = compose_clip(Side(pictures=plain(RED, 2), known=known), plain(BLUE, 2))
+    demo, agent = read_about(data)["sides"]
+    assert {name: demo[name] for name in known} == known and "left" not in agent
+    assert jpeg_fault(sealed(data)) == "" and read_about(sealed(data)) == read_about(data)
+    with pytest.raises(ValueError, match=r"."):
+        read_about(data[:2] + data[-2:])
 
 
 def test_durations_do_not_drift():
@@ -103,11 +108,6 @@ def test_any_shape_is_fitted_whole_and_centred(size):
 def test_a_frame_of_the_right_size_is_not_touched():
     frame = stepping(RED)[3]
     assert np.array_equal(fit(frame), frame)
-
-
-def test_sides_of_different_shapes_share_a_clip():
-    frames = decode(compose_clip(plain(RED, 3, (640, 360)), plain(BLUE, 3, (64, 64))), 3)
-    assert frames.shape == (3, CLIP_HEIGHT, CLIP_WIDTH, 3)
 
 
 @pytest.mark.parametrize(

@@ -230,9 +230,9 @@ def test_the_built_in_demo_is_read_once_for_all_clips(tmp_path):
     from onedemo.training import pictures
 
     demo = find_demo("hopper-backflip", tmp_path)
-    pictures._fitted.cache_clear()
-    assert pictures._fitted(demo) is pictures._fitted(find_demo("hopper-backflip", tmp_path))
-    pictures._fitted.cache_clear()
+    pictures._filmed.cache_clear()
+    assert pictures._filmed(demo)[0] is pictures._filmed(find_demo("hopper-backflip", tmp_path))[0]
+    pictures._filmed.cache_clear()
 
 
 def test_as_many_clips_wait_as_people_rate_while_the_robot_practises_once():

@@ -1,0 +1,201 @@
+"""Where in a video whatever moves is, told by its pictures alone.
+
+Pictures of the robot's own studio are known by their sky. There the camera is known, and with it heights
+and sizes; the limbs are told by their colours, and the way of the camera by the squares of the floor.
+Of any other video, what differs from the median picture is taken as what moves, as long as that is
+neither next to nothing nor most of the picture.
+
+Shapes: F pictures, H rows, W columns. Places in pictures are pixels from the upper left corner.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from onedemo.render.backdrop import SKY_HORIZON, SKY_TOP
+from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FREE_ABOVE, LIMB_COLOURS, studio
+
+_CALM = 4.0  # pictures over which a view's way is smoothed
+BODY = 1.45
+"""Length at which a mover of unknown size is shown, metres: the robot's own, stretched out."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Mover:
+    """What is known of what moves in a video."""
+
+    scale: float
+    """Pixels a metre."""
+    floor: float
+    """The row of the floor under it."""
+    box: np.ndarray
+    """Left, top, right, bottom in each picture, (F, 4)."""
+    aim: np.ndarray
+    """The column that a view which follows it keeps in its middle, (F,)."""
+    head: np.ndarray | None = None
+    """Column and row in each picture, (F, 2); None where parts cannot be told."""
+    foot: np.ndarray | None = None
+    """The same."""
+    way: np.ndarray | None = None
+    """Metres that the camera has gone along the track, (F,); None where floor and sizes are guessed."""
+    outlines: tuple[np.ndarray, ...]
+    """Its border in each picture, (n, 2) each; empty where it was not seen."""
+
+    def at(self, frames: np.ndarray) -> Mover:
+        """Of some of the pictures, (k,)."""
+        tracks = {
+            name: track if track is None else track[frames]
+            for name in ("box", "aim", "head", "foot", "way")
+            for track in [getattr(self, name)]
+        }
+        return replace(self, **tracks, outlines=tuple(self.outlines[frame] for frame in frames))
+
+
+def locate(frames: np.ndarray) -> Mover | None:
+    """Finds what moves.
+
+    Args:
+        frames: (F, H, W, 3), uint8 RGB.
+
+    Returns:
+        None if it cannot be told from what is around it.
+    """
+    return _in_studio(frames) if is_studio(frames) else _before_background(frames)
+
+
+def is_studio(frames: np.ndarray) -> bool:
+    """Whether pictures are of the robot's studio, seen whole: known by their sky."""
+    height, width = frames.shape[1:3]
+    if width * 3 != height * 4:
+        return False
+    rows = height // 8
+    t = (np.linspace(0, 1, height // 2)[:rows, None] ** 1.5).astype(np.float32)
+    sky = SKY_TOP * (1 - t) + SKY_HORIZON * t
+    some = frames[:: max(1, len(frames) // 12), :rows]
+    return bool(np.abs(np.median(some, axis=2) - sky).mean() < 4)
+
+
+def _in_studio(frames: np.ndarray) -> Mover | None:
+    height, width = frames.shape[1:3]
+    view = studio(width, height)
+    box = np.full((len(frames), 4), np.nan)
+    head, foot = np.full((len(frames), 2), np.nan), np.full((len(frames), 2), np.nan)
+    turn = np.zeros(len(frames))
+    outlines = []
+    colours = np.asarray(LIMB_COLOURS) - np.mean(LIMB_COLOURS, axis=1, keepdims=True)
+    colours = (colours / np.linalg.norm(colours, axis=1, keepdims=True)).astype(np.float32)
+    pattern = _floor_pattern(height, width)
+    for index, frame in enumerate(frames):
+        bright = frame.max(axis=2)
+        solid = ((bright - frame.min(axis=2)) > 45).astype(np.uint8)
+        solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+        outlines.append(_outline(solid))
+        turn[index] = _phase(frame, pattern)
+        rows, columns = np.nonzero(solid)
+        if len(rows) < 40:
+            continue
+        box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        places = np.stack([columns, rows], axis=1) + 0.5
+        tint = frame[rows, columns].astype(np.float32)
+        tint -= tint.mean(axis=1, keepdims=True)
+        limb = np.argmax(tint @ colours.T, axis=1)
+        head[index] = _far_end(places[limb == 0], places[(limb == 1) | (limb == 2)])
+        if (feet := places[limb == 3]).size > 20:
+            foot[index] = feet.mean(axis=0)
+    # Where the camera rises with the robot, heights are not known.
+    top = height - (CAMERA_HEIGHT + FREE_ABOVE - 0.03 - view.bottom) * view.scale
+    if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
+        return None
+    way = np.unwrap(turn) / math.pi
+    return Mover(
+        scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
+        aim=np.full(len(frames), width / 2), head=_filled(head), foot=_filled(foot), way=way - way[0],
+        outlines=tuple(outlines),
+    )  # fmt: skip
+
+
+def _far_end(limb: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The end of a straight limb, (n, 2), that is away from the others, (m, 2)."""
+    if len(limb) < 20 or not len(rest):
+        return np.full(2, np.nan)
+    middle = limb.mean(axis=0)
+    lengths, axes = np.linalg.eigh(np.cov((limb - middle).T))
+    axis = axes[:, 1] * np.sign(axes[:, 1] @ (middle - rest.mean(axis=0)) or 1)
+    return middle + 0.8 * math.sqrt(3 * lengths[1]) * axis
+
+
+def _floor_pattern(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the floor before the lane, and what turns by how far the camera has gone over its squares."""
+    focal = studio(width, height).scale * CAMERA_DISTANCE
+    rows = np.arange(height // 2, height)
+    depth = CAMERA_HEIGHT * focal / (rows + 0.5 - height / 2)
+    y = depth - CAMERA_DISTANCE
+    clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92) | (y > 1.08) & (y < 1.9)
+    sign = np.where(np.mod(y, 2) < 1, 1.0, -1.0)
+    x = depth[:, None] * ((np.arange(width) + 0.5 - width / 2) / focal)
+    wave = sign[:, None] * np.exp(-1j * math.pi * x)
+    return rows[clear], (wave - wave.mean(axis=1, keepdims=True))[clear].astype(np.complex64)
+
+
+def _phase(frame: np.ndarray, pattern: tuple[np.ndarray, np.ndarray]) -> float:
+    rows, wave = pattern
+    return float(np.angle(np.vdot(wave.conj(), frame[rows, :, 1].astype(np.float32))))
+
+
+def _before_background(frames: np.ndarray) -> Mover | None:
+    height, width = frames.shape[1:3]
+    by = max(1.0, width / 240)
+    size = (round(width / by), round(height / by))
+    small = np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
+    background = np.median(small[:: max(1, len(small) // 48)], axis=0).astype(np.uint8)
+    box = np.full((len(frames), 4), np.nan)
+    shares, outlines = [], []
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
+    for index, frame in enumerate(small):
+        other = (cv2.absdiff(frame, background).max(axis=2) > 30).astype(np.uint8)
+        other = cv2.morphologyEx(other, cv2.MORPH_OPEN, kernel)
+        joined = cv2.dilate(other, kernel, iterations=3)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(joined)
+        shares.append(other.mean())
+        areas = stats[1:, cv2.CC_STAT_AREA]
+        outlines.append(np.empty((0, 2)))
+        if not len(areas) or areas.max() < 0.004 * other.size:
+            continue
+        large = 1 + np.flatnonzero(areas > 0.3 * areas.max())
+        solid = (np.isin(labels, large) & (other > 0)).astype(np.uint8)
+        rows, columns = np.nonzero(solid)
+        box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+        outlines[-1] = _outline(cv2.morphologyEx(solid, cv2.MORPH_CLOSE, kernel, iterations=2)) * by
+    if np.mean(shares) > 0.2 or np.isnan(box[:, 0]).mean() > 0.3:
+        return None
+    box = _filled(box) * by
+    sides = np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
+    return Mover(
+        scale=float(np.percentile(sides, 90)) / BODY,
+        floor=float(np.percentile(box[:, 3], 95)),
+        box=box,
+        aim=cv2.GaussianBlur((box[:, :1] + box[:, 2:3]) / 2, (1, 0), sigmaX=1, sigmaY=_CALM)[:, 0],
+        outlines=tuple(outlines),
+    )
+
+
+def _outline(solid: np.ndarray) -> np.ndarray:
+    """The border of the largest part, (n, 2), simplified."""
+    found, _ = cv2.findContours(solid, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not found:
+        return np.empty((0, 2))
+    return cv2.approxPolyDP(max(found, key=cv2.contourArea), 1.0, True)[:, 0] + 0.5
+
+
+def _filled(track: np.ndarray) -> np.ndarray:
+    """A track, (F, n), with gaps bridged by straight lines."""
+    times = np.arange(len(track))
+    filled = track.copy()
+    for values in filled.T:
+        seen = ~np.isnan(values)
+        values[:] = np.interp(times, times[seen], values[seen]) if seen.any() else 0.0
+    return filled
