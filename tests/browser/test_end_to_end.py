@@ -25,6 +25,7 @@ SETTINGS = {
     "ratings.online": 40,
     "ratings.queue": 4,
     "rollouts.lanes": 16,
+    "rollouts.threads": 1,
     "predictor.updates": 100,
     "practice.random_lanes": 8,
     "practice.bank_tries": 500,

@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import resource
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -155,7 +156,8 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
             trainer.stop()
 
 
-def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium):
+def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium, looked):
+    shutil.copytree(looked, tmp_path / "data")
     settings = ["predictor.appearance=false", *FEW_STATES]
     with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
         (run,) = (row["id"] for row in store.runs.all())

@@ -16,9 +16,9 @@ import viser
 from helpers.beside_playwright import run
 from onedemo.app.dataset import csv_writer
 from onedemo.app.http.auth import AccessControl
-from onedemo.app.http.server import Front, check_port
+from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
-from onedemo.app.network.bind import Listening
+from onedemo.app.network.bind import Listening, check_port
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
 from onedemo.storage.rating_records import RATING_COLUMNS
