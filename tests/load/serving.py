@@ -206,7 +206,7 @@ async def bring(session: ClientSession, server: Server, phase: str) -> None:
     if await asyncio.to_thread(server.phase) == phase:
         return
     page = await open_tab(session, server.links["researcher"])
-    await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
+    await page.until(lambda: "alt+P" in page.keys, "the key that pauses", _PATIENCE_S)
     await page.press("alt+P")
     await reach(lambda: server.phase() == phase, f"the phase {phase}")
     await page.close()

@@ -44,13 +44,13 @@ def test_presses_are_timed_until_the_next_clip_is_painted_and_lost_ones_noticed(
     assert [figure.name for figure in pressed] == ["press_1_annotator", "press_4_annotators"]
     for figure in pressed:
         assert math.isfinite(figure.value) and figure.reach == 2 and not figure.at_least
-        assert all(0 < p95 < 20_000 for side in figure.sides.values() for p95 in side)
+        assert all(0 < p95 < 120_000 for side in figure.sides.values() for p95 in side)
     figures = {figure.name: figure for figure in together}
     assert figures["crowd_lost"].met and re.search(r"of ([5-9]|1\d)$", figures["crowd_lost"].what)
-    assert 0 < figures["crowd_press_median_ms"].value <= figures["crowd_press_ms"].value < 20_000
+    assert 0 < figures["crowd_press_median_ms"].value <= figures["crowd_press_ms"].value < 120_000
     assert 50 < figures["crowd_memory_start_mib"].value < 4000
     training, paused = seen
-    assert training.reach == 100 and 0 < paused.value < 20_000 and 0 < training.value < 20_000
+    assert training.reach == 100 and 0 < paused.value < 120_000 and 0 < training.value < 120_000
 
 
 def loss_doubling_and_change_are_noticed(study):

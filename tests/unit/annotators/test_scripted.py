@@ -115,7 +115,7 @@ def test_wild_random_motion_gets_more_than_ones(marks):
     """Statistics of the random policy, printed; a rater of ones alone would teach nothing."""
     from onedemo.config import load_config
 
-    rollouts = Learner(load_config(None, {}), 66, 30.0).random_rollouts()
+    rollouts = Learner(load_config(None, {"practice.random_lanes": 32}), 66, 30.0).random_rollouts()
     lanes = zip(rollouts.qpos, rollouts.qvel, strict=True)
     rated = [ratings(marks, qpos, qvel, every=12) for qpos, qvel in lanes]
     found = np.bincount(np.concatenate(rated), minlength=6)[1:] / (len(rated) * len(rated[0]))
