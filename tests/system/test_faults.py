@@ -23,8 +23,6 @@ from unit.training.test_trainer import make_trainer, rate_all, wait_for
 
 pytestmark = pytest.mark.seam
 
-PATIENCE_MS = 180_000
-
 HOLD = """
 import sqlite3, sys
 db = sqlite3.connect(sys.argv[1], isolation_level=None)
@@ -169,16 +167,15 @@ def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, m
         monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))  # no driver is there
         with serving(tmp_path / "data") as server:
             page = chromium.new_page()
+            page.set_default_timeout(180_000)
             page.goto(server.links["annotator"])
             for _ in range(3):
-                clip = page.wait_for_selector(".od-clip > [data-clip][data-frame]", timeout=PATIENCE_MS)
+                clip = page.wait_for_selector(".od-clip > [data-clip][data-frame]")
                 number = clip.get_attribute("data-clip")
                 page.wait_for_timeout(600)
                 page.keyboard.press("4")
-                page.wait_for_selector(
-                    f".od-clip > [data-clip]:not([data-clip='{number}'])", timeout=PATIENCE_MS
-                )
-            banner = page.wait_for_selector(".od-banner", timeout=PATIENCE_MS)
+                page.wait_for_selector(f".od-clip > [data-clip]:not([data-clip='{number}'])")
+            banner = page.wait_for_selector(".od-banner")
             assert "no OpenGL driver" in banner.inner_text() and "apt-get install" in banner.inner_text()
             assert "go on rating" in banner.inner_text()
             page.close()
