@@ -59,7 +59,7 @@ def connect(url, *, link=None, headers=None, path=None):
                     headers={"Origin": url} if headers is None else headers,
                 ) as socket:
                     assert socket.protocol == f"viser-v{viser.__version__}"
-                    message = await socket.receive(timeout=5)
+                    message = await socket.receive(timeout=60)
                     assert message.type is aiohttp.WSMsgType.BINARY
                     return 101
             except aiohttp.WSServerHandshakeError as error:
