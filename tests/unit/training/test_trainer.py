@@ -316,8 +316,9 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo):
 def test_the_live_robot_follows_policy_and_snapshot(store, demo):
     ann = store.accounts.ensure("Ann", "annotator")
     config = small_config(
-        method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
-    )
+        method="onedemo", predictor__appearance=False, predictor__members=1,
+        rollouts__total_steps=10**6, ratings__pretrain=12,
+    )  # fmt: skip
     training = make_run(store, demo, config=config)
     trainer_ = Trainer(training)
     trainer_.start()
