@@ -17,13 +17,14 @@ run: .venv/.installed
 
 setup: .venv/.installed
 
-# Side by side on two cores. Those with servers and browsers stay together by file: they share them.
+# Side by side on two cores. Those with servers and browsers stay together by file, which they share. They
+# wait for what others do during a third of their time, so three at once keep two cores busy.
 TWO := -n 2
-TWO_BY_FILE := -n 2 --dist loadfile --no-loadscope-reorder
+THREE_BY_FILE := -n 3 --dist loadfile --no-loadscope-reorder
 
 test: .venv/.installed-test
 	$(BIN)/python -m pytest $(TWO) -m "not seam"
-	$(BIN)/python -m pytest $(TWO_BY_FILE) -m seam
+	$(BIN)/python -m pytest $(THREE_BY_FILE) -m seam
 
 test-fast: .venv/.installed-test
 	$(BIN)/python -m pytest $(TWO) -m "not seam and not slow"

@@ -84,8 +84,7 @@ def serve(
     if not 0 <= port <= 65535:
         raise UserError(f"argument --port: must be a whole number from 0 to 65535, got '{port}'")
     from onedemo.app.annotation.assignment import Again
-    from onedemo.app.cli.serve import serve as serve_page
-    from onedemo.app.network.bind import Listening
+    from onedemo.app.network.bind import Listening, check_port
     from onedemo.demos.library import find_demo
 
     listening = Listening(
@@ -99,9 +98,15 @@ def serve(
         again = Again(shared=shared, repeated=repeated)
     except ValueError as error:
         raise UserError(str(error)) from None
+    demo = find_demo(options.demo, options.data_dir / "demos")
+    listening.ssl_context()
+    check_port(listening.host, listening.port)
+    # Only now: it loads all that computes and draws, which takes seconds.
+    from onedemo.app.cli.serve import serve as serve_page
+
     serve_page(
         data_dir=options.data_dir,
-        demo=find_demo(options.demo, options.data_dir / "demos"),
+        demo=demo,
         config=config,
         explicit=bool(overrides) or options.config is not None,
         encoder_weights=options.encoder_weights,

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 from onedemo.app.annotation.assignment import Again
-from onedemo.app.http.server import Front, check_port
+from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret, write_address
 from onedemo.app.network.bind import Listening
 from onedemo.app.services.run_manager import Study
@@ -51,17 +51,15 @@ def serve(
         config: Settings of a new run.
         explicit: Whether a run that is resumed must have these settings, too.
         encoder_weights: Weights of the encoder, if not its own.
-        listening: Where people reach the page.
+        listening: Where people reach the page; its certificate and its port can be used.
         run: Name of the run to go on with or to make; None: the newest of this demo.
         new_run: Start over even if there is a run of this demo.
         again: How many clips are asked again.
         compare: Whether annotators are asked pairs, too.
 
     Raises:
-        UserError: If the data directory or the port cannot be used.
+        UserError: If the data directory cannot be used.
     """
-    listening.ssl_context()  # before anything is written
-    check_port(listening.host, listening.port)
     sys.setswitchinterval(_SWITCH_SECONDS)
     limit_logs()
     store = Store(data_dir)

@@ -8,7 +8,6 @@ style sheet and scripts added (``assets``). The connections below all this are `
 from __future__ import annotations
 
 import asyncio
-import socket
 import sqlite3
 import threading
 from collections.abc import Callable
@@ -31,7 +30,7 @@ from onedemo.app.http.media import Files, Filmed
 from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.http.viser_proxy import Proxy
-from onedemo.app.network.bind import Listening
+from onedemo.app.network.bind import Listening, not_opened
 from onedemo.app.network.capacity import Limits, raise_descriptors
 from onedemo.app.network.connections import Connections
 from onedemo.app.network.rate_limit import (
@@ -95,17 +94,6 @@ class Inside(Protocol):
     def tabs(self, role: str) -> list[str]:
         """The tabs of a role as their addresses end, the first one first."""
         ...
-
-
-def check_port(host: str, port: int) -> None:
-    """Raises UserError if the port cannot be opened now; to be called before anything is written."""
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind((host, port))
-    except (OSError, OverflowError, UnicodeError) as error:
-        raise _explain(error, host, port) from None
 
 
 class Front:
@@ -218,7 +206,7 @@ class Front:
         ready.wait()
         if failure:
             self._thread.join()
-            raise _explain(failure[0], self._host, self._port) from None
+            raise not_opened(failure[0], self._host, self._port) from None
         return self._listening.address(self._port)
 
     def close(self) -> None:
@@ -355,10 +343,3 @@ class Front:
 
 def _person(request: web.Request) -> int | None:
     return request[RATER].id if RATER in request else None
-
-
-def _explain(error: BaseException, host: str, port: int) -> UserError:
-    if isinstance(error, OSError) and error.errno in (98, 48, 10048):
-        return UserError(f"port {port} on {host} is in use; choose another with --port")
-    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-    return UserError(f"port {port} on {host} cannot be opened ({reason}); choose another with --port")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
+import socket
 import ssl
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,3 +162,22 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises UserError if the port cannot be opened now; to be called before anything is written."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise not_opened(error, host, port) from None
+
+
+def not_opened(error: BaseException, host: str, port: int) -> UserError:
+    """Why a port cannot be opened, in words."""
+    if isinstance(error, OSError) and error.errno in (98, 48, 10048):
+        return UserError(f"port {port} on {host} is in use; choose another with --port")
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return UserError(f"port {port} on {host} cannot be opened ({reason}); choose another with --port")

@@ -25,6 +25,7 @@ SETTINGS = {
     "ratings.online": 40,
     "ratings.queue": 4,
     "rollouts.lanes": 16,
+    "rollouts.threads": 1,
     "predictor.updates": 100,
     "practice.random_lanes": 8,
     "practice.bank_tries": 500,
@@ -86,13 +87,13 @@ def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
         skip_practice(page)
         expected = [rate(page, data_dir, value, how) for value, how in ways]
     assert rows(data_dir) == expected
-    until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 60)
+    until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 180)
     with opened(chromium, links["researcher"], TINY) as page:
         page.click('.od-tabs >> text="Watch"')
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
         where = page.locator("canvas[data-engine]").bounding_box()
         seen: set[bytes] = set()  # empty, drawn, and moving
-        until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 60)
+        until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 180)
         page.click('.od-tabs >> text="Data"')
         page.wait_for_selector(f".od-data >> text=method {method}")
         with page.expect_download() as download:
@@ -120,7 +121,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     with opened(chromium, links["annotator"]) as page:
         skip_practice(page)
         given = [rate(page, data_dir, value) for value in (1, 2, 3, 1, 2)]
-        until(lambda: iterations(data_dir) >= 2, 90)
+        until(lambda: iterations(data_dir) >= 2, 180)
         given += [rate(page, data_dir, value) for value in (4, 2)]
         page.keyboard.press("3")  # and the process dies in that moment
         child.kill()
@@ -131,7 +132,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     began = time.monotonic()
     _, again, log = serving.start(*QUICK)
     assert again, log.read_text()
-    assert time.monotonic() - began < 30
+    assert time.monotonic() - began < 120
     assert [link.split("token=")[1] for link in again.values()] == [
         link.split("token=")[1] for link in links.values()
     ]
@@ -139,7 +140,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     with opened(chromium, again["annotator"]) as page:
         page.wait_for_selector(f".od-progress >> text=Everybody: {len(before)} of 45")
         rate(page, data_dir, 5)
-    until(lambda: iterations(data_dir) > done, 90)
+    until(lambda: iterations(data_dir) > done, 180)
     with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:
         assert db.execute("SELECT COUNT(*) FROM runs").fetchone() == (1,)
         numbers = [n for (n,) in db.execute("SELECT number FROM iterations ORDER BY number")]

@@ -39,9 +39,10 @@ def opened(
     page = _left.pop() if _left and not new else chromium.new_context(**options).new_page()
     for script in scripts:
         page.context.add_init_script(script)
+    page.set_default_timeout(90_000)  # of each wait; the machine may have much else to do
     page.set_viewport_size(viewport)
     page.goto(link)
-    page.wait_for_selector(".od-header", timeout=90_000)
+    page.wait_for_selector(".od-header")
     kept = False
     try:
         yield page
@@ -91,7 +92,7 @@ def drawn(page, side: str) -> list[int]:
     )
 
 
-def until(condition: Callable[[], Any], seconds: float = 10.0) -> Any:
+def until(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
     """Waits until something is true, and returns it."""
     end = time.monotonic() + seconds
     while not (value := condition()):

@@ -1,7 +1,9 @@
-"""A small training in a process of its own that may die: ``dying.py DIRECTORY METHOD RATER MOMENT``.
+"""Small trainings in processes that die: ``killed_training.py PLACE METHOD RATER MOMENT...``.
 
-It begins, or goes on from what is on disk, and ends by SIGKILL at the moment, or when it is done if that
-is "". ``outcome`` is what it leaves behind. For ``test_resume.py``.
+One in PLACE/whole is left alone. One in PLACE/broken ends by SIGKILL at each moment, goes on in the next
+process from what is on disk, and comes to its end in the last. All are forks of a process that has
+imported what they need and has done nothing yet: importing takes as long as such a training.
+``outcome`` is what they leave behind. For ``test_resume.py``.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import os
 import signal
 import sqlite3
 import sys
+import traceback
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -79,8 +82,9 @@ def arm(moment: str) -> None:
 def practise(data_dir: Path, method: str, rater: str) -> None:
     """The training, from whatever is on disk."""
     config = small_world.small_config(
-        method=method, ratings__rounds=4, predictor__appearance=False, predictor__members=1
-    )
+        method=method, ratings__rounds=3, ratings__online=4, rollouts__total_steps=1600,
+        predictor__appearance=False, predictor__members=1,
+    )  # fmt: skip
     demo = Demo(**json.loads((data_dir.parent / "demo.json").read_text()))
     demo = replace(demo, path=Path(demo.path))
     with closing(Store(data_dir)) as store:
@@ -125,8 +129,34 @@ def outcome(data_dir: Path) -> dict:
     return found
 
 
+def begin(data_dir: Path, method: str, rater: str, moment: str = "") -> int:
+    """The number of a process that trains there until it is done, or dies at that moment."""
+    if child := os.fork():
+        return child
+    code = 1
+    try:
+        if moment:
+            arm(moment)
+        practise(data_dir, method, rater)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def end(child: int, expected: int, what: str) -> None:
+    """Waits until it has ended, as it should."""
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code != expected:
+        sys.exit(f"{what}: ended with {code}, not {expected}")
+
+
 if __name__ == "__main__":
-    directory, method, rater, moment = sys.argv[1:]
-    if moment:
-        arm(moment)
-    practise(Path(directory), method, rater)
+    place, method, rater, *moments = sys.argv[1:]
+    whole = begin(Path(place) / "whole", method, rater)
+    for moment in moments:
+        end(begin(Path(place) / "broken", method, rater, moment), -signal.SIGKILL, moment)
+    end(begin(Path(place) / "broken", method, rater), 0, "the last")
+    end(whole, 0, "the one that was left alone")

@@ -25,8 +25,11 @@ from load.annotators import Press, Tab, browser_session, open_tab, rate_for, rat
 from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 
-FEW_STATES = ("practice.random_lanes=8", "practice.bank_tries=500", "ratings.queue=4")
-"""Settings of a run that is not to learn anything: it begins 5 s sooner, and draws fewer clips."""
+FEW_STATES = (
+    "practice.random_lanes=8", "practice.bank_tries=500", "ratings.queue=4", "rollouts.threads=1",
+)  # fmt: skip
+"""Settings of a run that is not to learn anything: it begins 5 s sooner, draws fewer clips, and its second
+thread does not wait busily on the core of whoever rates."""
 _PATIENCE_S = 900.0
 _AHEAD = 6
 """Clips that wait for each person: two are at the page, two may be rated while the robot practises once."""
@@ -203,9 +206,9 @@ async def bring(session: ClientSession, server: Server, phase: str) -> None:
     if await asyncio.to_thread(server.phase) == phase:
         return
     page = await open_tab(session, server.links["researcher"])
-    await page.until(lambda: "alt+2" in page.keys, "the tab Watch")
+    await page.until(lambda: "alt+2" in page.keys, "the tab Watch", _PATIENCE_S)
     await page.press("alt+2")
-    await page.until(lambda: "alt+P" in page.keys, "the key that pauses")
+    await page.until(lambda: "alt+P" in page.keys, "the key that pauses", _PATIENCE_S)
     await page.press("alt+P")
     await reach(lambda: server.phase() == phase, f"the phase {phase}")
     await page.close()

@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import resource
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -107,13 +108,13 @@ def test_a_training_says_what_is_wrong_and_goes_on_once_it_is_not(tmp_path, requ
         trainer = make_trainer(store, demo, config=config, rest_s=(0.5, 1.0))
         trainer.start()
         try:
-            wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1, 60)
+            wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1)
             given = trainer.status().ratings
             with fault(store.path):
-                wait_for(lambda: words in trainer.status().error, 60)
+                wait_for(lambda: words in trainer.status().error)
                 assert trainer.status().phase == "failed" and trainer.status().ratings == given
             done = trainer.status().iteration
-            wait_for(lambda: trainer.status().iteration > done and not trainer.status().error, 60)
+            wait_for(lambda: trainer.status().iteration > done and not trainer.status().error)
             assert trainer.status().phase == "online" and trainer.status().ratings == given
         finally:
             trainer.stop()
@@ -139,40 +140,42 @@ def test_what_fails_again_and_again_is_one_steady_state(tmp_path, monkeypatch):
         trainer = make_trainer(store, demo, config=config, rest_s=(0.1, 0.1))
         trainer.start()
         try:
-            wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1, 60)
+            wait_for(lambda: rate_all(store, "r", ann) or trainer.status().iteration >= 1)
             with monkeypatch.context() as broken:
                 broken.setattr("onedemo.training.learner.Learner.iterate", break_down)
-                wait_for(lambda: trainer.status().error, 60)
+                wait_for(lambda: trainer.status().error)
                 seen, end = set(), time.monotonic() + 60
                 while len(tries) < 4:
                     assert time.monotonic() < end
                     seen.add((trainer.status().phase, bool(trainer.status().error)))
                     time.sleep(0.002)
                 assert seen == {("failed", True)}
-            wait_for(lambda: not trainer.status().error, 60)
+            wait_for(lambda: not trainer.status().error)
             assert trainer.status().phase == "online"
         finally:
             trainer.stop()
 
 
-def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium):
+def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, monkeypatch, chromium, looked):
+    shutil.copytree(looked, tmp_path / "data")
     settings = ["predictor.appearance=false", *FEW_STATES]
     with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
         (run,) = (row["id"] for row in store.runs.all())
-        wait_for(lambda: len(store.clips.waiting(run)) == 4, 60)
+        wait_for(lambda: len(store.clips.waiting(run)) == 4)
         drawn = {clip.id for clip in store.clips.waiting(run)}
         server.kill()
         monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))  # no driver is there
         with serving(tmp_path / "data") as server:
             page = chromium.new_page()
+            page.set_default_timeout(180_000)
             page.goto(server.links["annotator"])
             for _ in range(3):
-                clip = page.wait_for_selector(".od-clip > [data-clip][data-frame]", timeout=60_000)
+                clip = page.wait_for_selector(".od-clip > [data-clip][data-frame]")
                 number = clip.get_attribute("data-clip")
                 page.wait_for_timeout(600)
                 page.keyboard.press("4")
-                page.wait_for_selector(f".od-clip > [data-clip]:not([data-clip='{number}'])", timeout=60_000)
-            banner = page.wait_for_selector(".od-banner", timeout=60_000)
+                page.wait_for_selector(f".od-clip > [data-clip]:not([data-clip='{number}'])")
+            banner = page.wait_for_selector(".od-banner")
             assert "no OpenGL driver" in banner.inner_text() and "apt-get install" in banner.inner_text()
             assert "go on rating" in banner.inner_text()
             page.close()

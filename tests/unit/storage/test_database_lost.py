@@ -60,7 +60,7 @@ def test_lost_files_are_noticed_and_everything_that_was_acknowledged_is_saved(tm
         harm(store.path)
         began = time.monotonic()
         wait_for(lambda: store.database.fault)
-        assert time.monotonic() - began < 10  # half a second, on a machine with time
+        assert time.monotonic() - began < 60  # half a second, on a machine with time
         assert "deleted or replaced. Nothing more is saved. Every rating until then" in store.database.fault
         with pytest.raises(DatabaseLost, match="deleted or replaced"):
             say(store, 1)

@@ -261,7 +261,7 @@ def test_the_policy_sees_what_the_demo_shows_now_and_ahead(features):
 @pytest.mark.slow
 def test_of_another_body_it_sees_pictures_and_imagines_poses(features):
     """No track: what the frames look like takes its place in the policy, and the predictor makes one up."""
-    learner = Learner(onedemo(), FRAMES, 30.0)
+    learner = Learner(onedemo(predictor__members=1), FRAMES, 30.0)
     learner.look_at(features, None)
     snapshot, _ = learner.fit(rated(learner), 1)
     assert isinstance(snapshot, MetricSnapshot)

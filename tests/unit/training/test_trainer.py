@@ -72,7 +72,8 @@ def by_rule(segment, demo_step):
     return int(np.clip(round(1 + 4 * segment.obs[:, 0].mean() + demo_step % 2), 1, 5))
 
 
-def wait_for(condition, seconds=30.0):
+def wait_for(condition, seconds=180.0):
+    """As long as it takes on a machine with much else to do; whoever waits in vain has found a fault."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "waited in vain"
@@ -315,8 +316,9 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo):
 def test_the_live_robot_follows_policy_and_snapshot(store, demo):
     ann = store.accounts.ensure("Ann", "annotator")
     config = small_config(
-        method="onedemo", predictor__appearance=False, rollouts__total_steps=10**6, ratings__pretrain=12
-    )
+        method="onedemo", predictor__appearance=False, predictor__members=1,
+        rollouts__total_steps=10**6, ratings__pretrain=12,
+    )  # fmt: skip
     training = make_run(store, demo, config=config)
     trainer_ = Trainer(training)
     trainer_.start()
@@ -331,7 +333,7 @@ def test_the_live_robot_follows_policy_and_snapshot(store, demo):
             )
         return trainer_.status().iteration >= 2
 
-    wait_for(rate_some, seconds=60)
+    wait_for(rate_some)
     trainer_.stop()
     one, two = trainer_.acting(), trainer_.acting()
     assert one is not None and two is not None and one.rules is not two.rules
@@ -381,7 +383,7 @@ def test_every_rating_asked_for_can_be_given(store, demo):
             store.ratings.rate(clip.id, ann.id, 3, latency_ms=5)
         return trainer_.status().ratings == 30
 
-    wait_for(rate_one, seconds=60)
+    wait_for(rate_one)
     assert not store.clips.waiting("r", "cut")
     trainer_.stop()
 
