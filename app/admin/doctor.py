@@ -13,6 +13,7 @@ from importlib import metadata
 from itertools import islice
 from pathlib import Path
 from shlex import quote
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from onedemo.config import RunConfig, load_config
 from onedemo.core.files import ON_SHARED, archive_fault, jpeg_fault
 from onedemo.core.shared_disks import file_system, is_shared
 from onedemo.demos.library import is_whole, list_demos
+from onedemo.demos.sandboxed_decoder import Options, decode
+from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
 from onedemo.storage.database import FILE_NAME, rescued_files
@@ -37,6 +40,8 @@ from onedemo.vision.encoders import make_encoder
 
 _NAMED = 3
 """Files of a kind that are named; of more, the number."""
+_FRAMES = 12
+"""Of the video that is tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +64,7 @@ def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
     checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
         ("onedemo", _version),
         ("pictures", _pictures),
+        ("videos", _videos),
         ("image network", lambda: _encoder(data_dir)),
         ("disk", lambda: _disk(data_dir)),
         ("privacy", lambda: _privacy(data_dir)),
@@ -99,6 +105,26 @@ def _pictures() -> Iterator[Finding]:
         )
     else:
         yield Finding("pictures", True, f"the robot can be drawn ({WIDTH} x {HEIGHT})")
+
+
+def _videos() -> Iterator[Finding]:
+    """Whether a video can be brought in: what decodes it has limits, which not every system grants."""
+    moving = (np.roll(np.indices((48, 64)).sum(0, dtype=np.uint8), 4 * k) for k in range(_FRAMES))
+    with TemporaryDirectory() as place:
+        file = Path(place) / "small.webm"
+        write_webm(file, (np.dstack([frame] * 3) for frame in moving), fps=30)
+        try:
+            with closing(decode(file, Options())) as frames:
+                count = sum(1 for _ in frames)
+        except UserError as error:
+            said = str(error).replace(str(file), "a small one of onedemo's own")
+            yield Finding("videos", False, f"no video can be brought in here: {said}")
+            return
+    yield Finding(
+        "videos", count == _FRAMES,
+        "videos can be brought in" if count == _FRAMES
+        else f"of {_FRAMES} pictures of a video {count} are decoded: install av again",
+    )  # fmt: skip
 
 
 def _encoder(data_dir: Path) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ import threading
 import zipfile
 from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,11 +26,13 @@ from helpers.small_world import falling_demo, small_config
 from load.annotators import browser_session, open_tab, rating
 from load.serving import FEW_STATES, reach, serving
 from onedemo.app.admin.backup import back_up
+from onedemo.app.admin.doctor import _videos
 from onedemo.app.admin.restore import restore
 from onedemo.app.cli.main import main
 from onedemo.app.http.tokens import read_secret
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
+from onedemo.demos.sandboxed_decoder import Limits, decode
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.reward.model import Snapshot
@@ -333,6 +336,15 @@ def test_what_a_server_saved_is_named_and_taken_in_as_the_doctor_says(data_dir, 
     (data_dir / f"{FILE_NAME}.rescued-2").write_bytes(b"half")
     (line,), _ = doctor(data_dir, capsys)
     assert re.search(r"rescued-2 is no whole database \(.*\): delete it", line)
+
+
+def test_the_doctor_says_when_no_video_can_be_brought_in(monkeypatch):
+    """Before, only bringing one in told."""
+    (well,) = _videos()
+    assert well.ok, well.said
+    monkeypatch.setattr("onedemo.app.admin.doctor.decode", partial(decode, limits=Limits(memory=64 << 20)))
+    (ill,) = _videos()
+    assert not ill.ok and ill.said.startswith("no video can be brought in here: a small one of onedemo's own")
 
 
 @pytest.mark.slow
