@@ -187,6 +187,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         queue.want()
         queue.fill(learner, None)
         queue.fill(learner, learner.random_rollouts())
+        drawing.submit(lambda renderer: None).result()
         wait_for(lambda: len(store.comparisons.waiting_pairs("r")) == 6)
         ready = store.comparisons.waiting_pairs("r")
         picture = cv2.imread(str(RunDirectory(tmp_path, "r").pair(ready[0].id)))
@@ -216,6 +217,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         after = ComparisonQueue(store, "r", RunDirectory(tmp_path, "r").pair, pictures, seed=0)
         after.want()
         after.fill(learner, learner.random_rollouts())
+        drawing.submit(lambda renderer: None).result()
         wait_for(lambda: len(store.comparisons.waiting_pairs("r")) == 6)
         waiting = [pair.id for pair in store.comparisons.waiting_pairs("r")]
         assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
