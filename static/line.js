@@ -119,9 +119,10 @@ const line = (() => {
   }
 
   function unconnected() {
+    const base = location.pathname.split(/\/r\/\d+/)[0];
     card("The page is here, but its live connection is not", [
-      "If a proxy stands before onedemo, it must pass WebSockets and the Host header on: " +
-        "docs/remote-access.md has the lines for nginx and Caddy.",
+      "If a proxy stands before onedemo, it must pass WebSockets and the Host header on. This prints the lines for nginx (or caddy):",
+      element("code", "", `onedemo proxy nginx --host-name ${location.hostname}${base && ` --base-path ${base}`}`),
       "Without a proxy: close other pages of onedemo in this browser, then reload.",
     ]);
   }
@@ -164,13 +165,13 @@ const line = (() => {
     show(made, text);
   }
 
-  // Over the page: what somebody must do something about.
+  // Over the page: what somebody must do something about; paragraphs are texts or elements.
   function card(title, paragraphs) {
     const made = element("div", "od-card-back");
     const inside = element("section", "od-card");
     inside.setAttribute("role", "alertdialog");
     inside.setAttribute("aria-label", title);
-    inside.append(element("h2", "", title), ...paragraphs.map((text) => element("p", "", text)));
+    inside.append(element("h2", "", title), ...paragraphs.map((one) => (typeof one === "string" ? element("p", "", one) : one)));
     inside.append(reloadButton("od-button od-primary"));
     made.append(inside);
     show(made, title);

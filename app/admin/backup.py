@@ -18,12 +18,13 @@ from typing import IO, NamedTuple
 from onedemo.app.admin.archive import FORMAT, MANIFEST, is_saved
 from onedemo.core.directories import Workshop, sync_directory
 from onedemo.errors import UserError
-from onedemo.storage.database import FILE_NAME
+from onedemo.storage.database import FILE_NAME, rescued_files
 from onedemo.storage.schema import check_schema
 
 _BLOCK = 1 << 20
 _OURS = re.compile(
-    rf"(.*/)?(lock|.*\.lock|address|\..*|.*\.damaged)|{re.escape(FILE_NAME)}-(wal|shm|journal)|uploads/.*"
+    rf"(.*/)?(lock|.*\.lock|address|\..*|.*\.damaged)|{re.escape(FILE_NAME)}(-(wal|shm|journal)|\.rescued-\d+)"
+    r"|uploads/.*"
 )
 """What onedemo writes into a data directory and nobody would miss in a backup."""
 _SNAPSHOT = re.compile(r"runs/([^/]+)/snapshots/(\d+)\.pt")
@@ -38,6 +39,8 @@ class Saved(NamedTuple):
     ratings: int
     left_out: list[str]
     """Files in the data directory that are none of onedemo's."""
+    rescued: list[Path]
+    """Databases that a server saved when it lost its own; not in the backup."""
 
 
 def back_up(data_dir: Path, file: Path) -> Saved:
@@ -97,7 +100,7 @@ def back_up(data_dir: Path, file: Path) -> Saved:
             os.fsync(whole.fileno())
         os.replace(half, file)
         sync_directory(file.absolute().parent)
-    return Saved(len(digests), file.stat().st_size, ratings, left_out)
+    return Saved(len(digests), file.stat().st_size, ratings, left_out, rescued_files(data_dir))
 
 
 def _copy_database(source: Path, copy: Path) -> tuple[int, dict[str, int]]:

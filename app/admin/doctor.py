@@ -12,17 +12,27 @@ from dataclasses import dataclass
 from importlib import metadata
 from itertools import islice
 from pathlib import Path
+from shlex import quote
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from onedemo.app.admin.inspection import faults_in_rows, give_up_after, seconds_for
+from onedemo.app.admin.inspection import (
+    check_contents,
+    faults_in_rows,
+    give_up_after,
+    opened_as_it_is,
+    seconds_for,
+)
 from onedemo.config import RunConfig, load_config
 from onedemo.core.files import ON_SHARED, archive_fault, jpeg_fault
 from onedemo.core.shared_disks import file_system, is_shared
 from onedemo.demos.library import is_whole, list_demos
+from onedemo.demos.sandboxed_decoder import Options, decode
+from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, RenderThread
-from onedemo.storage.database import FILE_NAME
+from onedemo.storage.database import FILE_NAME, rescued_files
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_schema
 from onedemo.training.runs import disk_needed
@@ -30,6 +40,8 @@ from onedemo.vision.encoders import make_encoder
 
 _NAMED = 3
 """Files of a kind that are named; of more, the number."""
+_FRAMES = 12
+"""Of the video that is tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +64,11 @@ def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
     checks: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
         ("onedemo", _version),
         ("pictures", _pictures),
+        ("videos", _videos),
         ("image network", lambda: _encoder(data_dir)),
         ("disk", lambda: _disk(data_dir)),
         ("privacy", lambda: _privacy(data_dir)),
+        ("rescued", lambda: _rescued(data_dir)),
     ]
     if (data_dir / FILE_NAME).exists():
         checks += [
@@ -68,7 +82,13 @@ def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
         except (UserError, OSError, sqlite3.Error) as error:
             yield Finding(what, False, str(error))
     if not (data_dir / FILE_NAME).exists():
-        yield Finding("database", True, f"none in {data_dir} yet")
+        runs = sorted(path.parent for path in data_dir.glob("runs/*/config.toml"))
+        yield Finding(
+            "database", not runs,
+            f"{data_dir / FILE_NAME} is missing, but {_name(runs)} is there: restore a backup into another "
+            "directory, or put a rescued database in its place if there is one"
+            if runs else f"none in {data_dir} yet",
+        )  # fmt: skip
 
 
 def _version() -> Iterator[Finding]:
@@ -85,6 +105,26 @@ def _pictures() -> Iterator[Finding]:
         )
     else:
         yield Finding("pictures", True, f"the robot can be drawn ({WIDTH} x {HEIGHT})")
+
+
+def _videos() -> Iterator[Finding]:
+    """Whether a video can be brought in: what decodes it has limits, which not every system grants."""
+    moving = (np.roll(np.indices((48, 64)).sum(0, dtype=np.uint8), 4 * k) for k in range(_FRAMES))
+    with TemporaryDirectory() as place:
+        file = Path(place) / "small.webm"
+        write_webm(file, (np.dstack([frame] * 3) for frame in moving), fps=30)
+        try:
+            with closing(decode(file, Options())) as frames:
+                count = sum(1 for _ in frames)
+        except UserError as error:
+            said = str(error).replace(str(file), "a small one of onedemo's own")
+            yield Finding("videos", False, f"no video can be brought in here: {said}")
+            return
+    yield Finding(
+        "videos", count == _FRAMES,
+        "videos can be brought in" if count == _FRAMES
+        else f"of {_FRAMES} pictures of a video {count} are decoded: install av again",
+    )  # fmt: skip
 
 
 def _encoder(data_dir: Path) -> Iterator[Finding]:
@@ -136,6 +176,25 @@ def _privacy(data_dir: Path) -> Iterator[Finding]:
         )
 
 
+def _rescued(data_dir: Path) -> Iterator[Finding]:
+    """What a server saved that had its database taken away: no run and no backup takes it up by itself."""
+    place = data_dir / FILE_NAME
+    for file in rescued_files(data_dir):
+        try:
+            with closing(opened_as_it_is(file)) as db:
+                holds = f"holds {_count(check_contents(db), 'rating')}"
+        except (ValueError, UserError, sqlite3.Error) as error:
+            yield Finding("rescued", False, f"{file} is no whole database ({error}): delete it")
+            continue
+        yield Finding(
+            "rescued", False,
+            f"{file} {holds}; a server saved it when its database was deleted, and no backup holds it: to go "
+            f"on with it, stop onedemo and run `rm -f {quote(f'{place}-wal')} {quote(f'{place}-shm')} && "
+            f"mv {quote(str(file))} {quote(str(place))}`; if "
+            f"{FILE_NAME} has all of it, delete it",
+        )  # fmt: skip
+
+
 def _needed(data_dir: Path) -> float:
     """Bytes that a run like the newest takes, or one with the defaults."""
     files = sorted(data_dir.glob("runs/*/config.toml"), key=lambda file: file.stat().st_mtime)
@@ -168,13 +227,6 @@ def _database(data_dir: Path, full: bool) -> Iterator[Finding]:
         if full and (wrong := list(islice(faults_in_rows(db), _NAMED))):
             yield Finding("database", False, f"{path} is damaged ({'; '.join(wrong)}): restore a backup")
             return
-    rescued = sorted(data_dir.glob(f"{FILE_NAME}.rescued-*"))
-    if rescued:
-        yield Finding(
-            "database", False,
-            f"{_name(rescued)} was saved when the database was deleted under a server: stop onedemo and put "
-            f"it in the place of {FILE_NAME}, without {FILE_NAME}-wal and -shm, or delete it",
-        )  # fmt: skip
     schema = f"schema {version}"
     if version < max(STEPS):
         schema += f", which is brought to {max(STEPS)} when onedemo opens it"

@@ -18,6 +18,8 @@ from onedemo.storage.rating_records import Answered
 LEASE_SECONDS = 120.0
 MOST_RATERS = 3
 """So many people are asked the same clip at most."""
+_MANY = 1000
+"""Leases, from which on those that have ended are forgotten."""
 REPEAT_AFTER = 15
 """Clips that a person has rated since, before one of them comes again: by then it is forgotten."""
 
@@ -128,6 +130,8 @@ class Assignment:
             The clip, or None if there is none.
         """
         with self._lock:
+            if len(self._leases) > _MANY:  # of clips that have gone, at pages that stay
+                self._leases = {clip: lease for clip, lease in self._leases.items() if lease.until > now}
             mine = None
             for clip in clips:
                 lease = self._leases.get(clip)

@@ -28,6 +28,8 @@ def backup(file: Path, /, *, force: bool = False, data_dir: DataDir = DATA) -> N
     if there.left_out:
         names = ", ".join(there.left_out[:3]) + (", ..." if len(there.left_out) > 3 else "")
         print(f"left out, since onedemo did not write it: {len(there.left_out)} files ({names})")
+    for saved in there.rescued:
+        print(f"not in it: {saved}, which a server saved when its database was deleted; see `onedemo doctor`")
     print("it holds the secret behind people's links: keep it where only you can read it")
 
 

@@ -6,8 +6,11 @@ Shapes: W control steps, o observations, a actions, q positions, v velocities.
 from __future__ import annotations
 
 import json
+import os
 import re
+import resource
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +29,12 @@ _GROUP = 500
 """Clips that are in memory at a time."""
 _MOST_NUMBERS, _MOST_TIMES = 1 << 23, 2
 """Of a file; or so many times its bytes. Motion has one for some eight bytes: it can hardly be packed."""
+_MOST_AT_A_TIME = 64 << 20
+"""Bytes that so many clips unpack to; they have some 4 MB."""
+_MOST_ABOUT = 1 << 24
+"""Bytes of what the file says of itself, at its end: columns, row groups, runs with their settings."""
+_MEMORY, _MEMORY_TIMES = 1 << 29, 4
+"""Bytes that reading may take, and so many times the file's size besides."""
 _MOST_STEPS = 10_000
 """Of a segment; one has some 40."""
 _MOST, _MOST_DEMO = 10**9, 10**7
@@ -88,7 +97,8 @@ def read_about(file: Path) -> tuple[list[Any], dict[str, str]]:
         UserError: If it is no such file.
     """
     try:
-        metadata = pq.read_schema(file).metadata or {}
+        with _opened(file) as source:
+            metadata = source.schema_arrow.metadata or {}
         runs, roles = json.loads(metadata[_RUNS]), json.loads(metadata[_ROLES])
         if not isinstance(runs, list) or not set(roles.values()) <= set(ROLES):
             raise ValueError("of another form")
@@ -161,7 +171,7 @@ def _read(
     file: Path, types: dict[str, pa.DataType], read: Callable[[dict[str, Any]], _Row]
 ) -> Iterator[_Row]:
     try:
-        with pq.ParquetFile(file) as source:
+        with _opened(file) as source:
             there = source.schema_arrow
             if there.names != list(types):
                 raise UserError(f"{file} has columns {there.names}, not {list(types)}")
@@ -173,7 +183,10 @@ def _read(
             numbers = sum(group.column(k).num_values for group in groups for k in range(group.num_columns))
             if numbers > max(_MOST_NUMBERS, _MOST_TIMES * file.stat().st_size):
                 raise UserError(f"{file} would unpack to {numbers:,} numbers: no export of onedemo does")
-            for block in source.iter_batches(batch_size=_GROUP):
+            for block in source.iter_batches(batch_size=_GROUP, use_threads=False):
+                numbers -= sum(_count(column) for column in block.columns)
+                if numbers < 0 or block.nbytes > _MOST_AT_A_TIME:  # what was said of them is not true
+                    raise UserError(f"{file} holds more than it says: no export of onedemo does")
                 for row in block.to_pylist():
                     try:
                         yield read(row)
@@ -183,9 +196,54 @@ def _read(
                         raise UserError(f"{file}: {kind} {row[key]} cannot be read: {error}") from None
     except FileNotFoundError:
         raise UserError(f"there is no file {file}") from None
+    except MemoryError:
+        raise UserError(f"{file} takes more memory than any export of its size: it is damaged") from None
     except (OSError, pa.ArrowException) as error:
         said = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise UserError(f"{file} is damaged: {said}") from None
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[pq.ParquetFile]:
+    """A Parquet file whose end is no larger than one of ours, read within bounds on memory.
+
+    Sizes and numbers in it may be anything: what a page says of itself is believed when memory for it is
+    asked for, so it is memory that is bounded, where the system can.
+
+    Raises:
+        UserError, OSError, MemoryError, pa.ArrowException: If it is none.
+    """
+    with file.open("rb") as raw:
+        size = raw.seek(0, os.SEEK_END)
+        raw.seek(max(0, size - 8))
+        about, mark = int.from_bytes(raw.read(4), "little"), raw.read(4)
+        if mark == b"PAR1" and about > _MOST_ABOUT:
+            raise UserError(f"{file} says more of itself than any export of onedemo")
+    with _memory_within(_MEMORY + _MEMORY_TIMES * size), pq.ParquetFile(file, pre_buffer=False) as source:
+        yield source
+
+
+@contextmanager
+def _memory_within(more: int) -> Iterator[None]:
+    """Memory that goes beyond what this process has by so many bytes is refused, where the system can."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with suppress(OSError, ValueError):  # a system without /proc, or without such a limit
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        most = pages * resource.getpagesize() + more
+        if soft == resource.RLIM_INFINITY or most < soft:
+            resource.setrlimit(resource.RLIMIT_AS, (most, hard))
+    try:
+        yield
+    finally:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _count(column: pa.Array) -> int:
+    """Values of a column as Parquet counts them: of nested lists the innermost."""
+    while pa.types.is_list(column.type):
+        column = column.flatten()
+    return len(column)
 
 
 def _lists(segment: Segment, side: str = "") -> dict[str, list]:

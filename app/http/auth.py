@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+import threading
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
 from typing import Literal, NamedTuple
@@ -19,7 +20,13 @@ from onedemo.app.http import assets
 from onedemo.app.http.sessions import RATER, Sessions
 from onedemo.app.http.tokens import hash_token, new_session_token
 from onedemo.app.network.bind import Listening
-from onedemo.app.network.rate_limit import WRONG_LINKS_AT_ONCE, WRONG_LINKS_PER_S, Buckets
+from onedemo.app.network.rate_limit import (
+    STRANGERS_AT_ONCE,
+    STRANGERS_PER_S,
+    WRONG_LINKS_AT_ONCE,
+    WRONG_LINKS_PER_S,
+    Buckets,
+)
 from onedemo.app.network.refusals import read_body
 from onedemo.app.templates import render
 from onedemo.storage.accounts import SESSION_DAYS, Link
@@ -57,6 +64,9 @@ SECURITY_HEADERS = {
 
 _RANK = {"annotator": 1, "researcher": 2}
 """Each may do what those before it may. Whoever is not named is a stranger."""
+_SLOWED_S = 1.0
+"""Until somebody who asks too often is told so; only so many connections can wait for that."""
+_TOO_OFTEN = "Too many requests came from your address. Please wait a minute."
 _LONGEST_LOGIN = 1024
 """Bytes of the form of the login page."""
 
@@ -81,6 +91,7 @@ class AccessControl:
         self.sessions = Sessions(store, listening, port)
         self.offences = Buckets(WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE)
         """Of each sender: wrong links, and requests that no browser sends."""
+        self._strangers = Buckets(STRANGERS_PER_S, STRANGERS_AT_ONCE)
 
     def application(self, routes: Iterable[Route]) -> web.Application:
         """A server of these routes and nothing else."""
@@ -118,6 +129,8 @@ class AccessControl:
         if request.method not in ("GET", "POST"):  # aiohttp answers HEAD by GET, which would open links
             raise web.HTTPMethodNotAllowed(request.method, ["GET", "POST"])
         await self.sessions.recognise(request)
+        if RATER not in request:
+            await self._slow_down(request)
         have = _RANK.get(request[RATER].role, 0) if RATER in request else 0
         # An address that does not exist is no secret, but strangers are not told which ones do.
         unknown = request.match_info.http_exception is not None
@@ -134,6 +147,18 @@ class AccessControl:
             detail = request.query_string
             await asyncio.to_thread(self._store.audit.note, request[RATER].name, what, detail)
         return await handler(request)
+
+    async def _slow_down(self, request: web.Request) -> None:
+        """Strangers are answered only so often; beyond that late, and once for each connection.
+
+        A link counts for itself, wherever it is opened: one that opens is not refused for what others do.
+        """
+        token = request.query.get("token", "") if request.path.endswith("/login") else ""
+        if not self._strangers[hash_token(token) if token else self._listening.sender(request)].take():
+            await asyncio.sleep(_SLOWED_S)
+            refusal = web.HTTPTooManyRequests(text=_TOO_OFTEN)
+            refusal.force_close()
+            raise refusal
 
     def _check_page(self, request: web.Request) -> None:
         if not same_origin(request):
@@ -218,9 +243,7 @@ class AccessControl:
         if link is None:
             return await self._refuse(request, token, link)
         session = await self._session_of(request, link) or new_session_token()
-        opened = await asyncio.to_thread(
-            self._store.accounts.open_link, hash_token(token), hash_token(session)
-        )
+        opened = await self._trade(token, session)
         if opened is None:
             return await self._refuse(request, token, link)
         with suppress(sqlite3.Error):  # the link is used, so its owner is let in
@@ -231,6 +254,23 @@ class AccessControl:
         response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id) + tab)
         self.sessions.put(request, response, opened.rater.id, session)
         return response
+
+    async def _trade(self, token: str, session: str) -> Link | None:
+        """As ``Accounts.open_link``; a link is not used up for somebody who was sent away meanwhile."""
+        decided = threading.Lock()
+
+        def first() -> bool:
+            return decided.acquire(blocking=False)
+
+        opening = asyncio.ensure_future(
+            asyncio.to_thread(self._store.accounts.open_link, hash_token(token), hash_token(session), first)
+        )
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            if first():
+                raise
+            return await opening  # it is being committed
 
     async def _session_of(self, request: web.Request, link: Link) -> str | None:
         """The session that this browser has by that link already, as far as the request tells."""
@@ -248,7 +288,10 @@ class AccessControl:
             if await self._session_of(request, link) is not None:
                 raise web.HTTPSeeOther(page)
         if not self.offences[self._listening.sender(request)].take():  # of links that open, none is refused
-            return self._login_page(429, _REFUSED["too many"])
+            await asyncio.sleep(_SLOWED_S)
+            response = self._login_page(429, _REFUSED["too many"])
+            response.force_close()
+            return response
         address = self._listening.client(request)
         why = "unknown" if link is None else link.state
         await asyncio.to_thread(

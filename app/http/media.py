@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
@@ -19,6 +20,8 @@ from onedemo.types import Clip
 _KEEP = {"Cache-Control": "private, max-age=31536000, immutable"}
 """Addresses of what differs between runs or demos end in ?v= and what they are of."""
 
+_TRIES = 3
+"""Of a picture that is deleted whenever it has been drawn."""
 _KINDS = {".jpg": "image/jpeg", ".webm": "video/webm"}
 
 T = TypeVar("T")
@@ -98,7 +101,7 @@ class Files:
         clip = await asyncio.to_thread(trainer.store.clips.get, number)
         if clip is None or clip.run != trainer.run:
             raise web.HTTPNotFound()
-        return await _file(trainer.clip_picture, clip)
+        return await _file(request, trainer.clip_picture, clip)
 
     async def pair(self, request: web.Request) -> web.StreamResponse:
         """The picture of a pair."""
@@ -106,12 +109,12 @@ class Files:
         trainer = self._page.trainer
         if await asyncio.to_thread(trainer.store.comparisons.pair_run, number) != trainer.run:
             raise web.HTTPNotFound()
-        return await _file(trainer.pair_picture, number)
+        return await _file(request, trainer.pair_picture, number)
 
     async def rollout(self, request: web.Request) -> web.StreamResponse:
         """The best rollout of an iteration: a picture, or the film."""
         iteration, suffix = int(request.match_info["iteration"]), request.match_info["suffix"]
-        return await _file(self._page.trainer.rollout_picture, iteration, suffix)
+        return await _file(request, self._page.trainer.rollout_picture, iteration, suffix)
 
     async def demo_frame(self, request: web.Request) -> web.StreamResponse:
         """A frame of the demo."""
@@ -138,13 +141,32 @@ class Files:
             raise web.HTTPNotFound(text="The demonstration's video is gone.") from None
 
 
-async def _file(ask: Callable[..., Future[Path]], *what: Any) -> web.FileResponse:
+async def _file(request: web.Request, ask: Callable[..., Future[Path]], *what: Any) -> web.Response:
     """A picture once it is there. Whoever waits for it holds no thread: others need those to rate."""
+    for _ in range(_TRIES):
+        try:
+            coming = await asyncio.to_thread(ask, *what)
+            path = await asyncio.shield(asyncio.wrap_future(coming))  # others may wait for the same
+        except (FileNotFoundError, KeyError):
+            raise web.HTTPNotFound() from None
+        except UserError as error:  # nothing can be drawn here
+            raise web.HTTPServiceUnavailable(text=str(error)) from None
+        with suppress(FileNotFoundError):  # deleted in between, by ``onedemo tidy``: it is drawn again
+            return _picture(request, path, await asyncio.to_thread(path.read_bytes))
+    raise web.HTTPServiceUnavailable(text="This picture is deleted as soon as it is drawn.")
+
+
+def _picture(request: web.Request, path: Path, data: bytes) -> web.Response:
+    """All of it, or the part that is asked for: browsers fetch films so."""
+    headers = _KEEP | {"Content-Type": _KINDS[path.suffix], "Accept-Ranges": "bytes"}
+    if "Range" not in request.headers:
+        return web.Response(body=data, headers=headers)
     try:
-        coming = await asyncio.to_thread(ask, *what)
-        path = await asyncio.shield(asyncio.wrap_future(coming))  # others may wait for the same
-    except (FileNotFoundError, KeyError):
-        raise web.HTTPNotFound() from None
-    except UserError as error:  # nothing can be drawn here
-        raise web.HTTPServiceUnavailable(text=str(error)) from None
-    return web.FileResponse(path, headers=_KEEP | {"Content-Type": _KINDS[path.suffix]})
+        first, end, _ = request.http_range.indices(len(data))
+    except ValueError:
+        first, end = 0, 0
+    if first >= end:
+        headers = {"Content-Range": f"bytes */{len(data)}"}
+        raise web.HTTPRequestRangeNotSatisfiable(headers=headers)
+    headers["Content-Range"] = f"bytes {first}-{end - 1}/{len(data)}"
+    return web.Response(status=206, body=data[first:end], headers=headers)

@@ -56,6 +56,8 @@ _LOOK_S = 1.0
 """How soon a page is closed whose session has ended."""
 _FOLLOWED_S = 20.0
 """Within this time a page opens its socket."""
+_MOST_FOLLOWED = 1000
+"""Sessions of which it is remembered that their page opens sockets: those that did so last."""
 _MOST_WARNINGS = 20
 """Of each kind."""
 _PROXY = "a proxy before this server must pass on WebSockets and the Host header; see `onedemo proxy nginx`"
@@ -82,8 +84,8 @@ class Proxy:
         self._sockets: dict[web.WebSocketResponse, str] = {}
         """Each open page, with the session it belongs to."""
         self._places = Places(most_pages, MOST_PAGES_EACH)
-        self._followed: set[str] = set()
-        """Sessions whose page has opened a socket."""
+        self._followed: dict[str, None] = {}
+        """Sessions whose page has opened a socket, the last of them, in order."""
         self._warned: dict[str, set[str]] = {}
         self._upstream: ClientSession | None = None
         self._watching: asyncio.Task[None] | None = None
@@ -113,7 +115,7 @@ class Proxy:
                 origin, request.host,
             )  # fmt: skip
             raise web.HTTPForbidden(text="This page can only be used from its own address.")
-        self._followed.add(request[SESSION])
+        self._note_socket(request[SESSION])
         with self._places.one(request[RATER].id) as free:
             if not free:
                 raise web.HTTPServiceUnavailable(
@@ -123,9 +125,16 @@ class Proxy:
 
     def expect(self, request: web.Request) -> None:
         """Notes that a page was given to a browser, and warns unless it opens its socket."""
-        asyncio.get_running_loop().call_later(
-            _FOLLOWED_S, self._look_for_socket, request[RATER], request[SESSION]
-        )
+        if request[SESSION] not in self._followed:
+            asyncio.get_running_loop().call_later(
+                _FOLLOWED_S, self._look_for_socket, request[RATER], request[SESSION]
+            )
+
+    def _note_socket(self, session: str) -> None:
+        self._followed.pop(session, None)
+        self._followed[session] = None
+        if len(self._followed) > _MOST_FOLLOWED:
+            del self._followed[next(iter(self._followed))]
 
     def _look_for_socket(self, rater: Rater, session: str) -> None:
         if session not in self._followed:

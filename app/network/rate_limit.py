@@ -22,6 +22,8 @@ LARGEST_MESSAGE = 1 << 16
 """Bytes; what the page needs is a few hundred."""
 WRONG_LINKS_PER_S, WRONG_LINKS_AT_ONCE = 1 / 6, 20
 """Of one sender: wrong links, and requests that no browser sends."""
+STRANGERS_PER_S, STRANGERS_AT_ONCE = 20.0, 300
+"""Requests of one sender that show no session. A class behind one address opens its links at once."""
 PRESSES_PER_S, PRESSES_AT_ONCE = 20.0, 100
 """Of one person."""
 PRESSES_WAITING, PRESSES_WAITING_EACH = 256, 4

@@ -10,6 +10,7 @@ import asyncio
 import base64
 import itertools
 import os
+import re
 import sys
 import zlib
 from collections.abc import Awaitable, Callable
@@ -51,7 +52,7 @@ async def always(aim: Aim, count: int, once: Callable[[int], Awaitable[None]], e
 
     async def one(number: int) -> None:
         while True:
-            with suppress(OSError, asyncio.IncompleteReadError):
+            with suppress(OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
                 await once(number)
             await asyncio.sleep(every_s)
 
@@ -159,12 +160,35 @@ async def pings(aim: Aim) -> None:
     await always(aim, 4, once, 0.1)
 
 
+async def requests(aim: Aim) -> None:
+    """Small requests without a session, complete and right, as fast as they are answered."""
+    places = ("/login", "/healthz", "/", "/r/1/session", "/login?token=x", "/clips/1.jpg")
+    cookies = f"Cookie: onedemo-{aim.port}=a; onedemo-{aim.port}=b; onedemo-{aim.port}=c\r\n"
+    asks = [f"GET {place} HTTP/1.1\r\n{_HOST}{cookies}\r\n".encode() for place in places]
+
+    async def once(number: int) -> None:
+        reader, writer = await connect(aim, number)
+        try:
+            for ask in itertools.cycle(asks):
+                writer.write(ask)
+                head = await reader.readuntil(b"\r\n\r\n")
+                size = re.search(rb"(?i)\ncontent-length: (\d+)", head)
+                if size is None:
+                    return
+                await reader.readexactly(int(size[1]))
+        finally:
+            writer.close()
+
+    await always(aim, min(aim.connections, 2 * ADDRESSES), once, 0.0)
+
+
 KINDS: dict[str, Callable[[Aim], Awaitable[None]]] = {
     "half connections": hold,
     "slow bodies": slow_bodies,
     "compressed login bodies": compressed,
     "bodies nobody reads": unread,
     "pings and empty fragments": pings,
+    "complete requests": requests,
 }
 
 

@@ -383,10 +383,13 @@ def handles(page: Page, new: set[int]) -> list[str]:
 
 
 async def send_requests(port: int, cookie: str, rng: random.Random, count: int, findings: Findings) -> None:
-    """Sends hostile requests, eight at a time."""
+    """Sends hostile requests, eight at a time, from many addresses: of one, so many strangers are slowed."""
 
-    async def one(data: bytes) -> None:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async def one(data: bytes, number: int) -> None:
+        local = (
+            (f"127.0.{number // 25_000}.{2 + number // 100 % 250}", 0) if sys.platform == "linux" else None
+        )
+        reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=local)
         try:
             writer.write(data)
             await writer.drain()
@@ -410,7 +413,8 @@ async def send_requests(port: int, cookie: str, rng: random.Random, count: int, 
 
     own = f"http://127.0.0.1:{port}"
     for start in range(0, count, 8):
-        await asyncio.gather(*(one(hostile_request(rng, cookie, own)) for _ in range(min(8, count - start))))
+        numbers = range(start, min(start + 8, count))
+        await asyncio.gather(*(one(hostile_request(rng, cookie, own), number) for number in numbers))
 
 
 _MUTATED = {

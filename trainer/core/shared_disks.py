@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TypeGuard
 
 from onedemo.errors import UserError
 
@@ -58,26 +59,40 @@ def is_shared(path: Path) -> bool:
     return file_system(path) in _NETWORK
 
 
-def refuse_if_elsewhere(lock: Path, *, watch_s: float = WATCH_S) -> None:
-    """Waits until nobody on another computer can be at work with that lock file.
+def refuse_if_elsewhere(*locks: Path, watch_s: float | None = None) -> None:
+    """Waits until nobody on another computer can be at work with these lock files: once for all of them.
 
-    Returns at once if nobody has written into it, or somebody on this computer did.
+    Returns at once if nobody has written into them, or somebody on this computer did. What somebody left
+    who has died is taken out, so that it is waited for once.
+
+    Args:
+        locks: Of one directory.
+        watch_s: Seconds; ``WATCH_S`` if not given.
 
     Raises:
-        UserError: If somebody is.
+        UserError: If somebody is at work.
     """
-    first = _read(lock)
-    if not first or first.get("kernel") == _kernel():
-        return
+    watch_s = WATCH_S if watch_s is None else watch_s
+    left = {lock: found for lock in locks if _is_elsewhere(found := _read(lock))}
     until = time.monotonic() + watch_s
-    while time.monotonic() < until:
+    while left and time.monotonic() < until:
         time.sleep(min(1.0, watch_s / 10))
-        if (now := _read(lock)) != first and now:
-            raise UserError(
-                f"a onedemo on the computer {str(now.get('host'))[:80]!a} (process {now.get('process')}) "
-                f"works on {lock.parent}, and two on one network directory destroy the database; "
-                "stop that one first"
-            )
+        for lock, before in left.items():
+            if (now := _read(lock)) != before and _is_elsewhere(now):
+                raise UserError(
+                    f"a onedemo on the computer {str(now.get('host'))[:80]!a} (process {now.get('process')}) "
+                    f"works on {lock.parent}, and two on one network directory destroy the database; "
+                    "stop that one first"
+                )
+    for lock, before in left.items():
+        if _read(lock) == before:
+            with suppress(OSError):
+                os.truncate(lock, 0)
+
+
+def _is_elsewhere(found: dict | None) -> TypeGuard[dict]:
+    """Whether a lock file tells of another computer, or of one before it was started again."""
+    return bool(found) and found.get("kernel") != _kernel()
 
 
 @contextmanager

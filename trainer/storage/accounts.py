@@ -6,8 +6,9 @@ Only hashes of tokens are kept: who reads the database cannot come in with what 
 from __future__ import annotations
 
 import sqlite3
+import threading
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Literal, NamedTuple
@@ -22,6 +23,8 @@ MOST_SESSIONS = 100
 """Of one link. A program that opens its link each time makes many; those longest unused end first."""
 _ENDED_DAYS = 7
 """How long it is still known why a session ended."""
+_MOST_USED = 10_000
+"""Sessions of which it is remembered when they were used: those that were used last."""
 
 # A time is compared as text: all are UTC in one form (onedemo.storage.database.now).
 _STATE = (
@@ -62,7 +65,8 @@ class Accounts:
     def __init__(self, database: Database) -> None:
         self._database = database
         self._used: dict[str, str] = {}
-        """When each session was last seen in use, by its hash."""
+        """When each session was last seen in use, by its hash, in that order."""
+        self._using = threading.Lock()
 
     def ensure(self, name: str, role: str) -> Rater:
         """The rater of that name, made if there is none.
@@ -127,7 +131,9 @@ class Accounts:
         """All links there ever were, in the order they were made."""
         return self._links("TRUE", {})
 
-    def open_link(self, token_hash: str, session_hash: str) -> Link | None:
+    def open_link(
+        self, token_hash: str, session_hash: str, wanted: Callable[[], bool] = lambda: True
+    ) -> Link | None:
         """Trades a link for a session; None if it does not open (any more). Of two at once, one may win.
 
         A session that there is already lasts 30 days from now on.
@@ -135,6 +141,11 @@ class Accounts:
         Args:
             token_hash: Of the link.
             session_hash: Of the session's token, which lasts 30 days.
+            wanted: Asked at the very end, as the database may have been waited for: whether somebody will
+                get the session. If not, the link stays as it was.
+
+        Raises:
+            TimeoutError: If it is not wanted any more.
         """
         with self._database.transaction() as db:
             link = self.link(token_hash)
@@ -148,6 +159,8 @@ class Accounts:
                 (_in(lasts), now(), session),
             )
             self._purge(db, link)
+            if not wanted():
+                raise TimeoutError("nobody waits for the session any more")
         return link
 
     def _purge(self, db: sqlite3.Connection, link: Link) -> None:
@@ -164,10 +177,7 @@ class Accounts:
         ).fetchall()
         if len(rows) > MOST_SESSIONS:
             rows.sort(key=lambda row: max(self._used.get(row[1], ""), row[2] or ""))
-            gone = rows[:-MOST_SESSIONS]
-            db.executemany("DELETE FROM tokens WHERE id = ?", [row[:1] for row in gone])
-            for row in gone:
-                self._used.pop(row[1], None)
+            db.executemany("DELETE FROM tokens WHERE id = ?", [row[:1] for row in rows[:-MOST_SESSIONS]])
 
     def session_state(self, session_hash: str) -> Literal["open", "expired", "revoked"] | None:
         """What has become of a session; None if it is not known, such as one that was signed out."""
@@ -187,7 +197,13 @@ class Accounts:
 
         That is kept in memory alone: pages come back within seconds of a restart.
         """
-        self._used |= dict.fromkeys(session_hashes, now())
+        at = now()
+        with self._using:
+            for session in session_hashes:
+                self._used.pop(session, None)
+                self._used[session] = at
+            while len(self._used) > _MOST_USED:
+                del self._used[next(iter(self._used))]
 
     def presence(self) -> dict[int, Presence]:
         """How many sessions each rater has, and when they were last seen, by the rater's number."""

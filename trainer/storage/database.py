@@ -34,6 +34,11 @@ _LOOK_S = 0.5
 """How often a process that writes looks whether its files are still there."""
 
 
+def rescued_files(data_dir: Path) -> list[Path]:
+    """What servers saved that had their database taken away while they had it open, oldest first."""
+    return sorted(data_dir.glob(f"{FILE_NAME}.rescued-*"), key=lambda file: file.stat().st_mtime)
+
+
 class Database:
     """The database in ``data_dir``; made or migrated when opened.
 
@@ -54,8 +59,7 @@ class Database:
         try:
             make_directory(self.path.parent, private=True)
             if is_shared(self.path.parent):
-                for lock in self.path.parent.glob("runs/*/lock"):
-                    refuse_if_elsewhere(lock)
+                refuse_if_elsewhere(*self.path.parent.glob("runs/*/lock"))
             self._make()
             self._db = self._connect()
         except (OSError, sqlite3.Error) as error:
@@ -157,9 +161,11 @@ class Database:
     def _check_new(self) -> None:
         lost = [path.parent for path in self.path.parent.glob("runs/*/config.toml")]
         if lost:
+            saved = rescued_files(self.path.parent)
             raise UserError(
-                f"{self.path} is missing, but {lost[0]} is there, a run that it knew: restore a backup into "
-                "another directory, or move the directory runs away to begin anew"
+                f"{self.path} is missing, but {lost[0]} is there, a run that it knew: "
+                + (f"mv {saved[-1]} {self.path}, which a server saved, or " if saved else "")
+                + "restore a backup into another directory, or move the directory runs away to begin anew"
             )
 
     def _there(self) -> tuple[tuple[int, int] | None, ...] | None:

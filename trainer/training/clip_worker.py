@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
+import sqlite3
+import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 
 from onedemo.core.files import jpeg_fault, read_whole
-from onedemo.errors import in_words
+from onedemo.errors import DatabaseLost, in_words
 from onedemo.render.renderer import Order
 from onedemo.storage.store import Store
 from onedemo.training.pictures import PictureFiles
@@ -18,6 +22,48 @@ from onedemo.types import Clip
 log = logging.getLogger("onedemo")
 
 _RETRY_S = 5.0
+_AGAIN_S = 1.0
+"""Between two tries to write into a database that another program holds."""
+
+
+class Notes:
+    """Tells the database what has been drawn, in a thread of its own: whoever draws waits for no lock.
+
+    What cannot be written now is written when it can be, in the order in which it was told.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._left: deque[Callable[[], object]] = deque()
+        self._writing = False
+
+    def add(self, write: Callable[[], object]) -> None:
+        """Has something written as soon as that can be; waits for nothing."""
+        with self._lock:
+            self._left.append(write)
+            if self._writing:
+                return
+            self._writing = True
+        threading.Thread(target=self._write, name="notes", daemon=True).start()
+
+    def _write(self) -> None:
+        while True:
+            with self._lock:
+                if not self._left:
+                    self._writing = False
+                    return
+                write = self._left[0]
+            try:
+                write()
+            except (DatabaseLost, sqlite3.ProgrammingError):  # lost, closed: the next process looks by itself
+                return
+            except sqlite3.OperationalError as error:
+                log.warning("what was drawn cannot be noted yet: %s", error)
+                time.sleep(_AGAIN_S)
+                continue
+            except Exception:
+                log.exception("what was drawn could not be noted")
+            self._left.popleft()
 
 
 class ClipMaker:
@@ -33,7 +79,8 @@ class ClipMaker:
         self._store = store
         self._file = file
         self._pictures = pictures
-        self._failed: list[Clip] = []
+        self._notes = Notes()
+        self._failed: dict[int, Clip] = {}
         self._failed_at = 0.0
         self.error = ""
         """Why the last clip could not be drawn, one sentence; "" if it could."""
@@ -51,8 +98,8 @@ class ClipMaker:
     def retry(self) -> None:
         """Queues the clips that failed once more, a few seconds after: a full disk may have room now."""
         if self._failed and time.monotonic() - self._failed_at > _RETRY_S:
-            failed, self._failed = self._failed, []
-            self.submit(failed)
+            failed, self._failed = self._failed, {}
+            self.submit(list(failed.values()))
 
     def recover(self, run: str) -> None:
         """After a restart: queues what was cut but never drawn, and what lost its picture or a part of it."""
@@ -71,15 +118,13 @@ class ClipMaker:
     def _note(self, future: Future[Path], clip: Clip) -> None:
         if future.cancelled():
             return
-        error, before = future.exception(), self.error
-        if error is None:
-            try:
-                self._store.clips.set_state([clip.id], "ready")
-            except Exception as failed:
-                error = failed
-        self.error = in_words(error) if error is not None else ""
-        if error is not None:
-            if self.error != before:  # once, not with every try
-                log.error("clip %d could not be drawn: %s", clip.id, self.error, exc_info=error)
-            self._failed_at = time.monotonic()
-            self._failed.append(clip)
+        if (error := future.exception()) is None:
+            self.error = ""
+            self._notes.add(partial(self._store.clips.set_state, [clip.id], "ready"))
+            return
+        said = in_words(error)
+        if said != self.error:  # once, not with every try
+            log.error("clip %d could not be drawn: %s", clip.id, said, exc_info=error)
+        self.error = said
+        self._failed_at = time.monotonic()
+        self._failed[clip.id] = clip

@@ -9,6 +9,7 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from onedemo.queries.selection import choose
 from onedemo.render.renderer import Order
 from onedemo.storage.comparisons import NewPair, Pair
 from onedemo.storage.store import Store
+from onedemo.training.clip_worker import Notes
 from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles
 from onedemo.types import Rollouts
@@ -53,6 +55,7 @@ class ComparisonQueue:
         self._store, self._run, self._file = store, run, file
         self._pictures = pictures
         self._rng = np.random.default_rng([seed, 1207])
+        self._notes = Notes()
         self._wanted_until = 0.0
         self._begun = False
 
@@ -113,7 +116,7 @@ class ComparisonQueue:
         if (error := future.exception()) is not None:
             log.error("pair %d could not be drawn", pair.id, exc_info=error)
             state = "withdrawn"
-        self._store.comparisons.set_pair_state([pair.id], state)
+        self._notes.add(partial(self._store.comparisons.set_pair_state, [pair.id], state))
 
 
 _OLD = 10

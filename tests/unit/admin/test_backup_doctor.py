@@ -14,6 +14,7 @@ import threading
 import zipfile
 from contextlib import closing
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,11 +26,13 @@ from helpers.small_world import falling_demo, small_config
 from load.annotators import browser_session, open_tab, rating
 from load.serving import FEW_STATES, reach, serving
 from onedemo.app.admin.backup import back_up
+from onedemo.app.admin.doctor import _videos
 from onedemo.app.admin.restore import restore
 from onedemo.app.cli.main import main
 from onedemo.app.http.tokens import read_secret
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
 from onedemo.demos.library import import_video
+from onedemo.demos.sandboxed_decoder import Limits, decode
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.reward.model import Snapshot
@@ -37,7 +40,7 @@ from onedemo.storage.database import FILE_NAME
 from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated
 from unit.demos.test_library import make_video
-from unit.training.test_trainer import headless, make_run, work
+from unit.training.test_trainer import headless, make_run, wait_for, work
 
 TABLES = ("events", "clips", "runs", "snapshots", "iterations", "segments", "raters")
 
@@ -299,6 +302,49 @@ def test_the_doctor_names_what_is_wrong(data_dir, capsys, harm, said):
     wrong, _ = doctor(data_dir, capsys)
     assert wrong
     assert any(re.search(said, line) for line in wrong), wrong
+
+
+def test_what_a_server_saved_is_named_and_taken_in_as_the_doctor_says(data_dir, tmp_path, capsys):
+    """The database was deleted under a server; before, the doctor said that there was none, and all well."""
+    with closing(Store(data_dir)) as store:
+        ratings = len(list(store.ratings.stream()))
+        store.audit.add("Ann", "rated")
+        store.path.unlink()
+        wait_for(lambda: store.database.fault)
+        saved = data_dir / f"{FILE_NAME}.rescued-1"
+    wrong, _ = doctor(data_dir, capsys)
+    assert any(
+        re.search(r"database .*sqlite3 is missing, but .*runs/falling-1 is there", line) for line in wrong
+    )
+    (line,) = [line for line in wrong if "rescued-1 holds" in line]
+    assert f"holds {ratings} ratings; a server saved it when its database was deleted" in line
+    with pytest.raises(
+        UserError, match=r"is missing.*mv .*rescued-1 .*onedemo\.sqlite3, which a server saved"
+    ):
+        Store(data_dir)
+    # A backup of what a server went on with does not hold it, and says so.
+    shutil.copy(saved, data_dir / FILE_NAME)
+    assert main(["backup", str(tmp_path / "b.zip"), "--data-dir", str(data_dir)]) == 0
+    said = capsys.readouterr().out
+    assert f"not in it: {saved}, which a server saved" in said and "did not write" not in said
+    (data_dir / FILE_NAME).unlink()
+    # As the doctor says.
+    subprocess.run(re.search(r"run `(.*)`", line)[1], shell=True, check=True)
+    with closing(Store(data_dir)) as store:
+        assert len(list(store.ratings.stream())) == ratings
+    assert doctor(data_dir, capsys)[0] == []
+    (data_dir / f"{FILE_NAME}.rescued-2").write_bytes(b"half")
+    (line,), _ = doctor(data_dir, capsys)
+    assert re.search(r"rescued-2 is no whole database \(.*\): delete it", line)
+
+
+def test_the_doctor_says_when_no_video_can_be_brought_in(monkeypatch):
+    """Before, only bringing one in told."""
+    (well,) = _videos()
+    assert well.ok, well.said
+    monkeypatch.setattr("onedemo.app.admin.doctor.decode", partial(decode, limits=Limits(memory=64 << 20)))
+    (ill,) = _videos()
+    assert not ill.ok and ill.said.startswith("no video can be brought in here: a small one of onedemo's own")
 
 
 @pytest.mark.slow

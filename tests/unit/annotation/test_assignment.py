@@ -438,3 +438,12 @@ def test_an_answer_counts_where_no_next_clip_can_be_looked_for(session, store, c
         patch.setattr(store.clips, "waiting", lambda *_: (_ for _ in ()).throw(sqlite3.OperationalError()))
         assert session.rate(1, 4) and session.current is None
     assert session.refill() and session.current == 2
+
+
+def test_leases_of_clips_that_have_gone_are_forgotten():
+    """At a page that stays open for weeks, whose clips were withdrawn before it came to them."""
+    leases = Assignment(lease_seconds=10)
+    for clip in range(5000):
+        assert leases.take("page", [clip], now=float(clip)) == clip
+    assert len(leases._leases) <= 1001
+    assert leases.take("other", [4999], now=5000.0) is None  # one that holds, still holds

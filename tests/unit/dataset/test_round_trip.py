@@ -4,7 +4,9 @@ import csv
 import io
 import json
 import re
+import resource
 import shutil
+import sys
 import zipfile
 from contextlib import closing
 
@@ -21,6 +23,7 @@ from helpers.small_disk import small_disk
 from onedemo.app.cli.main import main
 from onedemo.app.dataset.card import card
 from onedemo.app.dataset.exporter import FILES
+from onedemo.app.dataset.parquet import _opened
 from onedemo.app.http.exports import Downloads
 from onedemo.baselines.preferences import stored_comparisons
 from onedemo.config import load_config, to_toml
@@ -213,6 +216,34 @@ def bomb(directory):
     assert file.stat().st_size < 1 << 20
 
 
+def varint(number, width=0):
+    """As Parquet's metadata has whole numbers (Thrift's compact protocol), as long as one wants it."""
+    left, out = 2 * number, bytearray()
+    while left > 127 or len(out) + 1 < width:
+        out.append(128 | left & 127)
+        left >>= 7
+    return bytes([*out, left])
+
+
+def liar(directory):
+    """The bomb, whose end says that it has a thousand numbers."""
+    bomb(directory)
+    file = directory / "segments.parquet"
+    data = file.read_bytes()
+    end = len(data) - 8 - int.from_bytes(data[-8:-4], "little")
+    true = varint(9_000_000)
+    assert true in data[end:]
+    file.write_bytes(data[:end] + data[end:].replace(true, varint(1000, len(true))))
+
+
+def talker(directory):
+    """Says 20 MB of itself; what that is made into is not asked."""
+    file = directory / "segments.parquet"
+    there = pq.read_table(file)
+    meta = there.schema.metadata | {b"more": bytes(20 << 20)}
+    pq.write_table(there.replace_schema_metadata(meta), file)
+
+
 EDITED = {
     "semicolons": (text(lambda b: b.replace(b",", b";")), "separated by ';': save it with commas"),
     "tabs": (text(lambda b: b.replace(b",", b"\t")), r"separated by '\\t'"),
@@ -271,6 +302,8 @@ EDITED = {
     ),
     "Parquet that was cut off": (text(lambda b: b[:-100], "segments.parquet"), "is not a file of segments"),
     "Parquet of 72 MB in 20 KB": (bomb, "would unpack to .* numbers: no export of onedemo does"),
+    "Parquet that says that it is small": (liar, "segments.parquet holds more than it says"),
+    "Parquet that says much of itself": (talker, "says more of itself than any export"),
     "HTML as a demo": (about({"demo": "<img src=x onerror=alert(1)>"}), "a name is 1 to 64 letters"),
     "a run with a path": (about({"id": "../../../home/x/.cargo"}), "a name is 1 to 84 letters"),
     "HTML as a version": (about({"version": "<b>1"}), "version is not a version"),
@@ -292,6 +325,16 @@ def test_an_edited_export_gets_a_sentence_and_leaves_nothing_behind(study, tmp_p
     with closing(Store(tmp_path / "again")) as store:
         assert store.runs.all() == [] and store.ratings.last_event() == 0 and not store.accounts.raters()
     assert not (tmp_path / "again" / "runs").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere memory is not limited")
+def test_parquet_that_asks_for_memory_gets_none(study):
+    """Whatever its end says, a page may unpack to anything; afterwards this process takes what it likes."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    with pytest.raises(MemoryError), _opened(study[1] / "segments.parquet"):
+        pa.allocate_buffer(1 << 31)
+    assert resource.getrlimit(resource.RLIMIT_AS) == before
+    pa.allocate_buffer(1 << 31)
 
 
 def test_a_browser_gets_everything_in_one_file(study, tmp_path):

@@ -55,8 +55,8 @@ def serve(trainer, visit, pictures=None):
         base = f"http://127.0.0.1:{runner.addresses[0][1]}"
         async with ClientSession() as session:
 
-            async def get(path):
-                async with session.get(base + path) as answer:
+            async def get(path, **headers):
+                async with session.get(base + path, headers=headers) as answer:
                     return answer.status, answer.headers["Content-Type"], await answer.read()
 
             try:
@@ -91,6 +91,52 @@ def test_a_clip_comes_although_forty_films_are_waited_for(trainer, tmp_path):
     clips, films = serve(trainer, visit)
     assert {status for status, *_ in clips} == {200} and clips[0][2].startswith(b"\xff\xd8")
     assert set(films) == {(200, "video/webm", b"a film")}
+
+
+@pytest.mark.parametrize(("times", "status"), [(1, 200), (2, 200), (99, 503)])
+def test_a_picture_that_is_deleted_before_it_is_sent_is_drawn_again(trainer, monkeypatch, times, status):
+    """`onedemo tidy` in another process; before, a 404."""
+    (clip,) = trainer.store.clips.waiting(trainer.run)
+    there, file = trainer.clip_picture, trainer.clip_file(clip.id)
+    picture, asked = file.read_bytes(), []
+
+    def draw(clip):
+        file.write_bytes(picture)
+        coming = there(clip)
+        asked.append(clip.id)
+        if len(asked) <= times:
+            file.unlink()
+        return coming
+
+    monkeypatch.setattr(trainer, "clip_picture", draw)
+    answer = serve(trainer, lambda get: get(f"/clips/{clip.id}.jpg"))
+    assert answer[0] == status and (status == 503 or answer[1:] == ("image/jpeg", picture))
+
+
+def test_a_film_comes_in_parts(trainer, tmp_path, monkeypatch):
+    """As browsers ask for it."""
+    film = tmp_path / "film.webm"
+    film.write_bytes(bytes(range(100)))
+    made = Future()
+    made.set_result(film)
+    monkeypatch.setattr(trainer, "rollout_picture", lambda *_: made)
+
+    async def visit(get):
+        asked = (
+            "bytes=0-",
+            "bytes=10-19",
+            "bytes=-5",
+            "bytes=90-1000",
+            "bytes=100-",
+            "bytes=7-3",
+            "lines=1-2",
+        )
+        return [await get("/rollouts/1.webm", Range=part) for part in asked]
+
+    *parts, late, backwards, other = serve(trainer, visit)
+    whole = bytes(range(100))
+    assert [body for *_, body in parts] == [whole, whole[10:20], whole[-5:], whole[90:]]
+    assert {status for status, *_ in parts} == {206} and late[0] == backwards[0] == other[0] == 416
 
 
 def test_what_is_not_there_and_what_cannot_be_drawn_say_so(trainer):

@@ -18,12 +18,15 @@ from helpers.beside_playwright import run
 from helpers.paths import ROOT
 from onedemo.app.annotation.presses import PageGone
 from onedemo.app.cli.main import main
-from onedemo.app.http import assets, viser_proxy
+from onedemo.app.http import assets, auth, viser_proxy
 from onedemo.app.http.auth import PAGE_HEADER
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, passing_link, read_address, read_secret, write_address
+from onedemo.app.network import refusals
 from onedemo.app.network.bind import Listening
+from onedemo.app.network.rate_limit import STRANGERS_AT_ONCE
 from onedemo.errors import UserError
+from onedemo.storage import accounts
 from onedemo.storage.accounts import MOST_SESSIONS
 from onedemo.storage.database import now
 from onedemo.storage.store import Store
@@ -300,6 +303,83 @@ def test_a_link_that_opened_once_leads_back_to_the_page_it_opened(store):
             assert strange.status == 403 and "was used already" in strange.text
 
     run(go())
+
+
+async def press_the_button(door, one, token):
+    """Opens a link that opens once; the status of the answer."""
+    async with one.session.post(
+        door.url + "/login", data={"token": token}, headers={"Origin": door.url}, allow_redirects=False
+    ) as answer:
+        return answer.status
+
+
+def test_a_link_is_not_used_up_for_somebody_who_was_sent_away(store, monkeypatch):
+    """The database was held for longer than anybody is kept waiting: before, the link was gone afterwards."""
+    monkeypatch.setattr(refusals, "LOGIN_S", 0.3)
+    token = passing_link(store, store.accounts.ensure("ann", "annotator"), "http://x", once=True)[-43:]
+
+    async def go():
+        async with front(store) as door, browser(door) as one:
+            with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
+                other.execute("BEGIN IMMEDIATE")
+                assert await press_the_button(door, one, token) == 503
+                other.execute("ROLLBACK")
+            await asyncio.to_thread(store.audit.add, "ann", "came after")  # what waited has had its turn
+            state = store.accounts.links()[0].state
+            monkeypatch.setattr(refusals, "LOGIN_S", 60.0)
+            return state, await press_the_button(door, one, token)
+
+    assert run(go()) == ("open", 303)
+
+
+def test_who_would_be_sent_away_while_the_session_is_committed_gets_it(store, monkeypatch):
+    monkeypatch.setattr(refusals, "LOGIN_S", 0.3)
+    token = passing_link(store, store.accounts.ensure("ann", "annotator"), "http://x", once=True)[-43:]
+    opened = store.accounts.open_link
+
+    def slowly(*about):
+        link = opened(*about)
+        time.sleep(1)
+        return link
+
+    monkeypatch.setattr(store.accounts, "open_link", slowly)
+
+    async def go():
+        async with front(store) as door, browser(door) as one:
+            assert await press_the_button(door, one, token) == 303
+            return (await one.get("/r/1/session")).status
+
+    assert run(go()) == 204
+
+
+def test_strangers_are_slowed_down_and_nobody_else(store, monkeypatch):
+    """Before, one address got as many answers as it could ask for."""
+    monkeypatch.setattr(auth, "_SLOWED_S", 0.01)
+
+    async def go():
+        async with front(store) as door, browser(door) as one, browser(door) as other:
+            await one.get(link_of(store, door.url, "ann"))
+            said = [await other.get(("/login", "/healthz", "/", "/x?token=1")[n % 4]) for n in range(400)]
+            refused = [answer for answer in said if answer.status == 429]
+            assert len(refused) > 20 and all(a.headers["Connection"] == "close" for a in refused)
+            assert {answer.status for answer in said[:STRANGERS_AT_ONCE]} == {200, 401}
+            # From the same address: somebody with a session, and somebody who opens a link.
+            assert [(await one.get("/r/1/session")).status for _ in range(400)] == [204] * 400
+            return (await other.get(link_of(store, door.url, "bob"))).status
+
+    assert run(go()) == 303
+
+
+def test_what_is_remembered_of_sessions_is_bounded(store, monkeypatch):
+    monkeypatch.setattr(accounts, "_MOST_USED", 50)
+    monkeypatch.setattr(viser_proxy, "_MOST_FOLLOWED", 50)
+    proxy = viser_proxy.Proxy(Behind(store), store)
+    for number in range(1000):
+        store.accounts.note_use([f"s{number}", "always"])
+        proxy._note_socket(f"s{number}")
+        proxy._note_socket("always")
+    assert len(store.accounts._used) == 50 and {"always", "s999"} <= set(store.accounts._used)
+    assert len(proxy._followed) == 50 and {"always", "s999"} <= set(proxy._followed)
 
 
 def test_opening_a_link_again_keeps_the_session(store):

@@ -24,6 +24,7 @@ from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles
 from onedemo.types import Segment
 from unit.queries.test_selection import rollouts
+from unit.training.test_trainer import wait_for
 
 
 def segment(value=0.0, steps=38):
@@ -187,8 +188,8 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         queue.fill(learner, None)
         queue.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
+        wait_for(lambda: len(store.comparisons.waiting_pairs("r")) == 6)
         ready = store.comparisons.waiting_pairs("r")
-        assert len(ready) == 6
         picture = cv2.imread(str(RunDirectory(tmp_path, "r").pair(ready[0].id)))
         assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
         robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
@@ -217,6 +218,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         after.want()
         after.fill(learner, learner.random_rollouts())
         drawing.submit(lambda renderer: None).result()
+        wait_for(lambda: len(store.comparisons.waiting_pairs("r")) == 6)
         waiting = [pair.id for pair in store.comparisons.waiting_pairs("r")]
         assert waiting[:3] == rest and len(waiting) == 6 and min(waiting[3:]) > undrawn
         assert all(RunDirectory(tmp_path, "r").pair(pair).exists() for pair in waiting)

@@ -2,7 +2,9 @@
 
 import os
 import re
+import sqlite3
 import threading
+import time
 from concurrent.futures import Future
 from contextlib import closing
 
@@ -17,11 +19,12 @@ from onedemo.render.renderer import Order, Renderer, RenderThread
 from onedemo.storage.clips import NewClip
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
-from onedemo.training.clip_worker import ClipMaker
+from onedemo.training.clip_worker import ClipMaker, Notes
 from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles, awaited, pictures_of, spare, tidy
 from onedemo.training.rating_queue import RatingQueue
 from onedemo.types import Demo, Segment
+from unit.training.test_trainer import wait_for
 
 MB = 1_000_000
 
@@ -163,6 +166,67 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
         assert {path for path, _, _ in pictures_of(files)} == awaited(store, files)
         assert main(["tidy", "--data-dir", str(tmp_path)]) == 0
         assert "0.0 MB freed" in capsys.readouterr().out
+
+
+def test_whoever_draws_waits_for_no_lock_of_another_program(tmp_path):
+    """Before, each picture came ten seconds after the one before it."""
+    drawing = Asked()
+    with closing(Store(tmp_path)) as store:
+        clips = thousand(store)[:4]
+        files = RunDirectory(tmp_path, "r")
+        maker = ClipMaker(store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), 0.008))
+        with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            began = time.monotonic()
+            maker.submit(clips[:3])
+            looked = maker.picture(clips[3])
+            for *_, drawn in drawing.jobs:  # what draws tells of one after another
+                drawn.set_result(None)
+            assert looked.result(0) == files.clip(clips[3].id)
+            assert time.monotonic() - began < 5 and store.clips.waiting("r") == []
+            other.execute("ROLLBACK")
+        wait_for(lambda: store.clips.waiting("r") == clips[:3])
+
+
+def test_what_was_drawn_is_noted_when_the_database_can_be_written(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("onedemo.training.clip_worker._AGAIN_S", 0.01)
+    notes, wrote = Notes(), []
+
+    def write(number, failing):
+        def one():
+            if failing:
+                raise failing.pop()
+            wrote.append(number)
+
+        return one
+
+    locked = sqlite3.OperationalError("database is locked")
+    notes.add(write(1, [locked, locked]))
+    notes.add(write(2, [ValueError("no clip")]))
+    notes.add(write(3, []))
+    wait_for(lambda: wrote == [1, 3])  # in their order; one that cannot be is not tried for ever
+    assert "no clip" in caplog.text
+    wait_for(lambda: not notes._writing)  # no thread is left
+    notes.add(write(4, []))
+    wait_for(lambda: wrote == [1, 3, 4])
+
+
+def test_a_clip_that_fails_again_and_again_is_drawn_once_with_each_try(tmp_path, monkeypatch):
+    monkeypatch.setattr("onedemo.training.clip_worker._RETRY_S", -1.0)
+    drawing = Asked()
+    with closing(Store(tmp_path)) as store:
+        store.clips.set_state([clip.id for clip in thousand(store)[3:]], "withdrawn")
+        files = RunDirectory(tmp_path, "r")
+        maker = ClipMaker(store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), 0.008))
+        for _ in range(3):  # the training fails, too, and takes the run up again
+            maker.recover("r")
+            for *_, drawn in drawing.jobs:
+                if not drawn.done():
+                    drawn.set_exception(OSError(28, "full"))
+        assert len(maker._failed) == 3 and "disk is full" in maker.error
+        drawing.jobs.clear()
+        maker.retry()
+        assert len(drawing.jobs) == 3
 
 
 def test_what_is_being_written_is_neither_counted_nor_deleted(tmp_path):
