@@ -20,6 +20,7 @@ from onedemo.render.backdrop import SKY_HORIZON, SKY_TOP
 from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FREE_ABOVE, LIMB_COLOURS, studio
 
 _CALM = 4.0  # pictures over which a view's way is smoothed
+_MOST = 0.15  # of a picture: what differs from the median when one body moves
 BODY = 1.45
 """Length at which a mover of unknown size is shown, metres: the robot's own, stretched out."""
 
@@ -90,12 +91,15 @@ def _in_studio(frames: np.ndarray) -> Mover | None:
     colours = (colours / np.linalg.norm(colours, axis=1, keepdims=True)).astype(np.float32)
     pattern = _floor_pattern(height, width)
     for index, frame in enumerate(frames):
-        bright = frame.max(axis=2)
-        solid = ((bright - frame.min(axis=2)) > 45).astype(np.uint8)
+        red, green, blue = cv2.split(frame)
+        bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
+        solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
         solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-        outlines.append(_outline(solid))
-        place[index] = _place(frame, solid, pattern)
-        rows, columns = np.nonzero(solid)
+        outlines.append(_outline(cv2.medianBlur(solid, 5)))
+        place[index] = _place(green, solid, pattern)
+        columns, rows = (
+            np.reshape(cv2.findNonZero(solid), (-1, 2)).T if solid.any() else np.empty((2, 0), int)
+        )
         if len(rows) < 40:
             continue
         box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
@@ -154,7 +158,7 @@ def _floor_pattern(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     rows = np.arange(height // 2, height)
     depth = CAMERA_HEIGHT * focal / (rows + 0.5 - height / 2)
     y = depth - CAMERA_DISTANCE
-    clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92) | (y > 1.08) & (y < 1.9)
+    clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92)  # neither on the lane nor on a border
     x = depth[clear, None] * ((np.arange(width) + 0.5 - width / 2) / focal)
     sign = np.where(np.mod(y[clear], 2) < 1, 1.0, -1.0)[:, None]
     places = np.arange(_PLACES)[:, None, None] * (2 / _PLACES)
@@ -166,12 +170,13 @@ def _floor_pattern(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 _PLACES = 200
 
 
-def _place(frame: np.ndarray, robot: np.ndarray, pattern: tuple[np.ndarray, np.ndarray]) -> float:
+def _place(green: np.ndarray, robot: np.ndarray, pattern: tuple[np.ndarray, np.ndarray]) -> float:
     """Where the camera is, metres, but for whole two; ``robot``: where the floor is not seen, (H, W)."""
     rows, squares = pattern
-    hidden = cv2.dilate(robot, np.ones((9, 9), np.uint8))[rows] > 0
-    floor = np.ma.masked_array(frame[rows, :, 1], hidden).astype(np.float32)
-    alike = squares @ (floor - floor.mean(axis=1, keepdims=True)).filled(0).ravel()
+    clear = (cv2.dilate(robot, np.ones((9, 9), np.uint8))[rows] == 0).astype(np.float32)
+    floor = green[rows] * clear
+    floor -= clear * (floor.sum(axis=1) / np.maximum(clear.sum(axis=1), 1))[:, None]
+    alike = squares @ floor.ravel()
     best = int(np.argmax(alike))
     before, here, after = (alike[(best + k) % _PLACES] for k in (-1, 0, 1))
     between = (before - after) / (2 * (before - 2 * here + after) or 1)
@@ -202,8 +207,9 @@ def _before_background(frames: np.ndarray) -> Mover | None:
         rows, columns = np.nonzero(solid)
         box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         outlines[-1] = _outline(cv2.morphologyEx(solid, cv2.MORPH_CLOSE, kernel, iterations=2)) * by
-    if np.mean(shares) > 0.2 or np.isnan(box[:, 0]).mean() > 0.3:
-        return None
+    areas = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]) / (size[0] * size[1])
+    if np.mean(shares) > _MOST or np.isnan(areas).mean() > 0.3 or np.nanmedian(areas) > 2 * _MOST:
+        return None  # the camera moves, or the trees do
     box = _filled(box) * by
     sides = np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
     return Mover(
