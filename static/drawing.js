@@ -57,7 +57,7 @@ const drawing = (() => {
       if (y > 14 * unit) pen.fillText(`${z} m`, width - 8 * unit, y - 4 * unit);
     }
     // On the near side of the robot's lane, where it hides none.
-    const near = (distance / (distance - 0.36)) * metre;
+    const near = (distance / (distance - 0.3)) * metre;
     const eye = side.eye[frame];
     const middle = at([eye, 0])[0];
     const y = at([0, cameraHeight])[1] + cameraHeight * near;
@@ -73,7 +73,7 @@ const drawing = (() => {
       pen.moveTo(x, y);
       pen.lineTo(x, y + (long ? 7 : 4) * unit);
       pen.stroke();
-      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${Math.abs(k / 4)}` : "0", x, y + 18 * unit);
+      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${Math.abs(k / 4)}` : "0", x, y + 17 * unit);
     }
   }
 

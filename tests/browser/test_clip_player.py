@@ -146,7 +146,7 @@ def test_head_and_foot_are_named_once_in_the_first_practice_clip(chromium, real)
         assert min(page.evaluate(counts, [HEAD, FOOT])) > 100
         page.wait_for_function(f"(colours) => Math.max(...({counts})(colours)) < 5", arg=[HEAD, FOOT])
         page.keyboard.press("5")
-        page.keyboard.press("Enter")
+        page.click("[data-go]")
         page.wait_for_selector(".od-progress >> text=Practice 2 of")
         page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)
         assert max(page.evaluate(counts, [HEAD, FOOT])) < 5

@@ -30,8 +30,8 @@ from onedemo.render.renderer import (
 )
 from onedemo.sim.kinematics import joint_points
 
-_BESIDE, _ABOVE, _BELOW = 0.1, 0.12, 0.15
-"""What is seen around the movers, metres."""
+_BESIDE, _ABOVE, _BELOW = 0.1, 0.12, 0.2
+"""What is seen around the movers, and of the floor below them with its marks; metres."""
 _LOWEST, _STEP = 1.15, 0.05
 """Heights of a view: at least, and in steps of, so that one clip looks like the next; metres."""
 _NEAR_FLOOR = 0.6

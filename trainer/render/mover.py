@@ -20,6 +20,7 @@ from onedemo.render.backdrop import SKY_HORIZON, SKY_TOP
 from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FREE_ABOVE, LIMB_COLOURS, studio
 
 _CALM = 4.0  # pictures over which a view's way is smoothed
+_MOST = 0.15  # of a picture: what differs from the median when one body moves
 BODY = 1.45
 """Length at which a mover of unknown size is shown, metres: the robot's own, stretched out."""
 
@@ -83,19 +84,22 @@ def _in_studio(frames: np.ndarray) -> Mover | None:
     height, width = frames.shape[1:3]
     view = studio(width, height)
     box = np.full((len(frames), 4), np.nan)
-    head, foot = np.full((len(frames), 2), np.nan), np.full((len(frames), 2), np.nan)
-    turn = np.zeros(len(frames))
-    outlines = []
+    torso, foot = np.full((len(frames), 4), np.nan), np.full((len(frames), 2), np.nan)
+    place = np.zeros(len(frames))
+    outlines: list[np.ndarray] = []
     colours = np.asarray(LIMB_COLOURS) - np.mean(LIMB_COLOURS, axis=1, keepdims=True)
     colours = (colours / np.linalg.norm(colours, axis=1, keepdims=True)).astype(np.float32)
     pattern = _floor_pattern(height, width)
     for index, frame in enumerate(frames):
-        bright = frame.max(axis=2)
-        solid = ((bright - frame.min(axis=2)) > 45).astype(np.uint8)
+        red, green, blue = cv2.split(frame)
+        bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
+        solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
         solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-        outlines.append(_outline(solid))
-        turn[index] = _phase(frame, pattern)
-        rows, columns = np.nonzero(solid)
+        outlines.append(_outline(cv2.medianBlur(solid, 5)))
+        place[index] = _place(green, solid, pattern)
+        columns, rows = (
+            np.reshape(cv2.findNonZero(solid), (-1, 2)).T if solid.any() else np.empty((2, 0), int)
+        )
         if len(rows) < 40:
             continue
         box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
@@ -103,47 +107,80 @@ def _in_studio(frames: np.ndarray) -> Mover | None:
         tint = frame[rows, columns].astype(np.float32)
         tint -= tint.mean(axis=1, keepdims=True)
         limb = np.argmax(tint @ colours.T, axis=1)
-        head[index] = _far_end(places[limb == 0], places[(limb == 1) | (limb == 2)])
+        torso[index] = _rod(places[limb == 0], places[(limb == 1) | (limb == 2)])
         if (feet := places[limb == 3]).size > 20:
             foot[index] = feet.mean(axis=0)
     # Where the camera rises with the robot, heights are not known.
     top = height - (CAMERA_HEIGHT + FREE_ABOVE - 0.03 - view.bottom) * view.scale
     if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
         return None
-    way = np.unwrap(turn) / math.pi
+    way = np.unwrap(place, period=2)
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
-        aim=np.full(len(frames), width / 2), head=_filled(head), foot=_filled(foot), way=way - way[0],
+        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot), way=way - way[0],
         outlines=tuple(outlines),
     )  # fmt: skip
 
 
-def _far_end(limb: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The end of a straight limb, (n, 2), that is away from the others, (m, 2)."""
+def _rod(limb: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The middle of a straight limb, (n, 2), and from there its end that is away from the others, (4,)."""
     if len(limb) < 20 or not len(rest):
-        return np.full(2, np.nan)
+        return np.full(4, np.nan)
     middle = limb.mean(axis=0)
     lengths, axes = np.linalg.eigh(np.cov((limb - middle).T))
-    axis = axes[:, 1] * np.sign(axes[:, 1] @ (middle - rest.mean(axis=0)) or 1)
-    return middle + 0.8 * math.sqrt(3 * lengths[1]) * axis
+    side = np.sign(axes[:, 1] @ (middle - rest.mean(axis=0))) or 1
+    return np.concatenate([middle, side * 0.8 * math.sqrt(3 * lengths[1]) * axes[:, 1]])
+
+
+def _ends(rods: np.ndarray) -> np.ndarray:
+    """One end of a limb through a video, (F, 4) to (F, 2): that which is away from the others mostly.
+
+    A limb that lies over them does not tell, but none turns over from picture to picture.
+    """
+    told, last, agree = rods.copy(), None, 0
+    for rod in told:
+        if np.isnan(rod[0]):
+            continue
+        turned = last is not None and rod[2:] @ last < 0
+        agree += -1 if turned else 1
+        if turned:
+            rod[2:] *= -1
+        last = rod[2:]
+    return told[:, :2] + (told[:, 2:] if agree >= 0 else -told[:, 2:])
 
 
 def _floor_pattern(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the floor before the lane, and what turns by how far the camera has gone over its squares."""
+    """Some rows of the floor, (r,), and its squares in them from many places of the camera, (P, r * W).
+
+    The places are a centimetre apart, over the two metres after which the squares come again.
+    """
     focal = studio(width, height).scale * CAMERA_DISTANCE
     rows = np.arange(height // 2, height)
     depth = CAMERA_HEIGHT * focal / (rows + 0.5 - height / 2)
     y = depth - CAMERA_DISTANCE
-    clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92) | (y > 1.08) & (y < 1.9)
-    sign = np.where(np.mod(y, 2) < 1, 1.0, -1.0)
-    x = depth[:, None] * ((np.arange(width) + 0.5 - width / 2) / focal)
-    wave = sign[:, None] * np.exp(-1j * math.pi * x)
-    return rows[clear], (wave - wave.mean(axis=1, keepdims=True))[clear].astype(np.complex64)
+    clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92)  # neither on the lane nor on a border
+    x = depth[clear, None] * ((np.arange(width) + 0.5 - width / 2) / focal)
+    sign = np.where(np.mod(y[clear], 2) < 1, 1.0, -1.0)[:, None]
+    places = np.arange(_PLACES)[:, None, None] * (2 / _PLACES)
+    squares = np.where(np.mod(x + places, 2) < 1, sign, -sign)
+    squares -= squares.mean(axis=2, keepdims=True)
+    return rows[clear], squares.reshape(_PLACES, -1).astype(np.float32)
 
 
-def _phase(frame: np.ndarray, pattern: tuple[np.ndarray, np.ndarray]) -> float:
-    rows, wave = pattern
-    return float(np.angle(np.vdot(wave.conj(), frame[rows, :, 1].astype(np.float32))))
+_PLACES = 200
+
+
+def _place(green: np.ndarray, robot: np.ndarray, pattern: tuple[np.ndarray, np.ndarray]) -> float:
+    """Where the camera is, metres, but for whole two; ``robot``: where the floor is not seen, (H, W)."""
+    rows, squares = pattern
+    clear = (cv2.dilate(robot, np.ones((9, 9), np.uint8))[rows] == 0).astype(np.float32)
+    floor = green[rows] * clear
+    floor -= clear * (floor.sum(axis=1) / np.maximum(clear.sum(axis=1), 1))[:, None]
+    alike = squares @ floor.ravel()
+    best = int(np.argmax(alike))
+    before, here, after = (alike[(best + k) % _PLACES] for k in (-1, 0, 1))
+    between = (before - after) / (2 * (before - 2 * here + after) or 1)
+    return (best + float(np.clip(between, -0.5, 0.5))) * 2 / _PLACES
 
 
 def _before_background(frames: np.ndarray) -> Mover | None:
@@ -170,8 +207,9 @@ def _before_background(frames: np.ndarray) -> Mover | None:
         rows, columns = np.nonzero(solid)
         box[index] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         outlines[-1] = _outline(cv2.morphologyEx(solid, cv2.MORPH_CLOSE, kernel, iterations=2)) * by
-    if np.mean(shares) > 0.2 or np.isnan(box[:, 0]).mean() > 0.3:
-        return None
+    areas = (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1]) / (size[0] * size[1])
+    if np.mean(shares) > _MOST or np.isnan(areas).mean() > 0.3 or np.nanmedian(areas) > 2 * _MOST:
+        return None  # the camera moves, or the trees do
     box = _filled(box) * by
     sides = np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
     return Mover(
