@@ -135,7 +135,10 @@ const charts = (() => {
       this.input.value = localStorage.getItem("onedemo-smoothing") ?? 0;
       this.input.addEventListener("input", () => {
         localStorage.setItem("onedemo-smoothing", this.input.value);
-        this.draw();
+        for (const group of groups) {
+          group.input.value = this.input.value;
+          group.draw();
+        }
       });
       this.back = element.querySelector("[data-zoom-out]");
       this.back.addEventListener("click", () => this.show(null));
@@ -221,6 +224,7 @@ const charts = (() => {
     }
 
     draw() {
+      if (!this.place.checkVisibility()) return; // in a fold: once that is opened
       const { lines, data } = this.#table();
       this.figure.toggleAttribute("data-drawn", Boolean(data));
       if (!data) return this.#drop();

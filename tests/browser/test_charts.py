@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from browser.test_page import DESKTOP, opened, until
+from browser.test_page import DESKTOP, SMALL, opened, until
 from helpers.curves import iteration_stats, train
+from onedemo.app.ui.viser_private import hang_up
 
 pytestmark = pytest.mark.seam
 
 PAINTED = """() => [...document.querySelectorAll(".uplot canvas")]
-  .filter((canvas) => canvas.clientWidth).map((canvas) => {
+  .filter((canvas) => canvas.checkVisibility()).map((canvas) => {
   const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
   let coloured = 0;
   for (let i = 0; i < data.length; i += 4) {
@@ -29,7 +30,8 @@ def lines_drawn(page, charts: int = 3) -> None:
         page.wait_for_function(
             f"() => {{ const painted = ({PAINTED})(); return painted.length >= {charts}"
             f" && painted.every((pixels) => pixels > {LEAST}) }}",
-            timeout=8_000,
+            polling=200,
+            timeout=30_000,
         )
     except Exception:
         raise AssertionError(f"coloured pixels: {page.evaluate(PAINTED)}") from None
@@ -41,23 +43,22 @@ def test_charts_show_their_lines_at_each_load_resize_and_reconnect(chromium, sit
     train(store, run, 1, 40)
     site.trainer.set_status(phase="online", iteration=40)
     number = 40
-    with opened(chromium, site.links["researcher"], DESKTOP, color_scheme=scheme) as page:
-        for load in range(6):
+    with opened(chromium, site.links["researcher"], SMALL, color_scheme=scheme) as page:
+        for load in range(6 if scheme == "light" else 2):
             if load:
                 page.reload()
             page.wait_for_selector(".uplot", timeout=60_000)
             lines_drawn(page)
             number += 1  # another iteration while somebody looks
             train(store, run, number, number)
-            page.wait_for_timeout(1200)
+            page.locator(f".od-value >> text='{iteration_stats(number)['predicted']:.3g}'").wait_for()
             lines_drawn(page)
         for size in ({"width": 2560, "height": 1440}, {"width": 390, "height": 844}, DESKTOP):
             page.set_viewport_size(size)
             page.wait_for_timeout(300)
             lines_drawn(page)
+        page.set_viewport_size(SMALL)
         for client in list(site.page._server.get_clients()):  # the connection goes; Viser comes back
-            from onedemo.app.ui.viser_private import hang_up
-
             hang_up(site.page._server, client)
         train(store, run, number + 1, number + 1)
         page.wait_for_timeout(1500)
