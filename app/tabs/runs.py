@@ -84,7 +84,7 @@ class Runs:
                     self._drawn = drawn
                     self._told_which.content = str(render("runs.html:which", drawn=len(drawn), more=more))
                     for curve in self._curves:
-                        curve.draw(drawn)
+                        curve.draw({run: self._rows[run] for run in drawn})
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""

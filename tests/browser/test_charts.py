@@ -24,7 +24,7 @@ PAINTED = """() => [...document.querySelectorAll(".uplot canvas")]
 LEAST = 60
 
 
-def lines_drawn(page, charts: int = 3) -> None:
+def lines_drawn(page, charts: int = 2) -> None:
     """Waits until so many charts show their lines; a second without load, more on a machine that is busy."""
     try:
         page.wait_for_function(
