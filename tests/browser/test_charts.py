@@ -97,7 +97,7 @@ def test_a_chart_tells_values_zooms_smooths_and_marks(chromium, site):
         def point(share, y=0.5):
             page.mouse.move(box["x"] + box["width"] * share, box["y"] + box["height"] * y)
 
-        point(19 / 39)
+        point(20 / 40)
         tip = page.locator(".od-tip")
         tip.wait_for()
         value = iteration_stats(20)["predicted"]
@@ -115,7 +115,7 @@ def test_a_chart_tells_values_zooms_smooths_and_marks(chromium, site):
         page.click("[data-zoom-out]")
         page.wait_for_selector("[data-zoom-out]", state="hidden")
         page.fill("[data-smooth]", "0.8")
-        point(19 / 39)
+        point(20 / 40)
         page.wait_for_selector(".od-tip >> text=measured")
         page.click('.od-tabs >> text="Watch"')
         page.fill("[data-smooth]", "0")
@@ -174,11 +174,16 @@ def test_robot_and_demo_have_one_scale_and_leave_room_for_charts(chromium, site)
             page.set_viewport_size({"width": width, "height": height})
             for scrolled in (0, 300):
                 page.evaluate(scroll, scrolled)
-                page.wait_for_timeout(250)
-                found = page.evaluate(boxes)
+                sides = ("x", "y", "width", "height")
+                found = until(
+                    lambda sides=sides: (
+                        (at := page.evaluate(boxes))
+                        and all(abs(at["canvas"][side] - at["robot"][side]) < 1.5 for side in sides)
+                        and at
+                    ),
+                    30,
+                )
                 where = (width, height, scrolled, found)
-                for side in ("x", "y", "width", "height"):
-                    assert abs(found["canvas"][side] - found["robot"][side]) < 1.5, where
                 assert abs(found["robot"]["height"] - found["demo"]["height"]) < 1, where
                 assert abs(found["robot"]["width"] / found["robot"]["height"] - 4 / 3) < 0.02, where
                 assert abs(found["demo"]["width"] / found["demo"]["height"] - 4 / 3) < 0.02, where
