@@ -135,7 +135,10 @@ const charts = (() => {
       this.input.value = localStorage.getItem("onedemo-smoothing") ?? 0;
       this.input.addEventListener("input", () => {
         localStorage.setItem("onedemo-smoothing", this.input.value);
-        this.draw();
+        for (const group of groups) {
+          group.input.value = this.input.value;
+          group.draw();
+        }
       });
       this.back = element.querySelector("[data-zoom-out]");
       this.back.addEventListener("click", () => this.show(null));
@@ -221,6 +224,7 @@ const charts = (() => {
     }
 
     draw() {
+      if (!this.place.checkVisibility()) return; // in a fold: once that is opened
       const { lines, data } = this.#table();
       this.figure.toggleAttribute("data-drawn", Boolean(data));
       if (!data) return this.#drop();
@@ -316,8 +320,13 @@ const charts = (() => {
       });
       const main = rows.filter(({ faint, level }) => !faint && !level);
       this.value.textContent = main.length > 1 ? "" : told(main[0]?.value);
-      const several = main.length > 1 || this.group.element.dataset.several !== undefined;
-      this.legend.replaceChildren(...(several ? main.map((line) => this.#item(line)) : []));
+      const compared = this.group.element.dataset.several !== undefined;
+      // Of several runs those without a value, too, so that nobody looks for their line.
+      const empty = ({ run, colour }) => ({ label: run, ...look(colour ?? 1), value: null });
+      const listed = compared
+        ? this.group.runs.map((run) => main.find(({ label }) => label === run) ?? empty(feeds.get(run)))
+        : main;
+      this.legend.replaceChildren(...(compared || main.length > 1 ? listed.map((line) => this.#item(line)) : []));
       this.place.setAttribute("aria-label", `${this.title}: ${main.map(({ label, value }) => (main.length > 1 ? `${label} ${told(value)}` : told(value))).join(", ")}`);
       let tip = this.place.querySelector(".od-tip");
       if (!hovered) return tip?.remove();

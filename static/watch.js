@@ -88,12 +88,16 @@
 
   // ---- The canvas goes with the page where that scrolls
 
-  document.addEventListener(
-    "scroll",
-    ({ target }) => {
-      if (target instanceof Element && target.matches(".mantine-Paper-root:has(.od-header)"))
-        document.documentElement.style.setProperty("--od-scrolled", `${target.scrollTop}px`);
-    },
-    { capture: true, passive: true },
-  );
+  // Looked at in each frame: a resize may move the page without saying so.
+  const narrow = window.matchMedia("(max-width: 900px)");
+  let page = null;
+  let scrolled = "";
+  function goWith() {
+    if (!page?.isConnected) page = document.querySelector(".mantine-Paper-root:has(.od-header)");
+    const now = `${page?.scrollTop ?? 0}px`;
+    if (now !== scrolled) document.documentElement.style.setProperty("--od-scrolled", (scrolled = now));
+    if (narrow.matches) requestAnimationFrame(goWith);
+  }
+  narrow.addEventListener("change", goWith);
+  goWith();
 })();

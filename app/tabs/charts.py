@@ -36,7 +36,11 @@ class Comparison:
         self._handle = gui.add_html("")
 
     def draw(self, runs: Iterable[str]) -> None:
-        """Shows the curves of some runs, by name; those that grow are followed by the browser."""
+        """Shows the curves of some runs; those that grow are followed by the browser.
+
+        Args:
+            runs: Their names, in order; a mapping by name will do.
+        """
         wanted = list(runs)
         if wanted != self._runs:
             self._runs = wanted

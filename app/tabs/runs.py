@@ -117,7 +117,7 @@ class Runs:
                 if grown or not self._drawn:
                     self._drawn = drawn
                     for curve in self._curves:
-                        curve.draw(drawn)
+                        curve.draw({run: self._rows[run] for run in drawn})
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""

@@ -215,7 +215,7 @@ class Watch:
             handle.content = self._content[id(handle)] = str(content)
 
 
-_UNPRACTISED = "The robot has not practised yet: it needs ratings first."
+_UNPRACTISED = "The robot has not practised yet."
 
 
 def frame_html(frame: int, sha256: str) -> Markup:

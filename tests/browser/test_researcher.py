@@ -190,7 +190,8 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
         page.wait_for_selector(".od-which >> text=6 runs drawn.")
 
         def legend():
-            return page.locator(".uplot").first.locator(".u-legend .u-label").all_inner_texts()[1:]
+            said = page.locator(".od-legend-of-chart").first.locator("span").all_inner_texts()
+            return [line.rsplit(" ", 1)[0] for line in said]
 
         newest = [f"hop-{k}" for k in range(49, 44, -1)]
         until(lambda: legend() == [*newest, site.trainer.run])

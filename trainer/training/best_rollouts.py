@@ -161,8 +161,9 @@ class Gallery:
         if file.suffix == ".jpg":
             return partial(draw_strip, file=file, qpos=qpos)
         return partial(
-            draw_film, file=file, demo=self._pictures.demo, qpos=qpos, frames=frames, dt=self._pictures.dt
-        )
+            draw_film, file=file, demo=self._pictures.demo, qpos=qpos, frames=frames, dt=self._pictures.dt,
+            title=f"Robot, iteration {iteration}",
+        )  # fmt: skip
 
     def _file(self, iteration: int, suffix: str) -> Path:
         return self._directory / f"{iteration:06d}.{suffix}"

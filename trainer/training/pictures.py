@@ -157,8 +157,9 @@ def draw_strip(renderer: Renderer, *, file: Path, qpos: np.ndarray) -> None:
 
 
 def draw_film(
-    renderer: Renderer, *, file: Path, demo: Demo, qpos: np.ndarray, frames: np.ndarray, dt: float
-) -> None:
+    renderer: Renderer, *, file: Path, demo: Demo, qpos: np.ndarray, frames: np.ndarray, dt: float,
+    title: str = "",
+) -> None:  # fmt: skip
     """Writes a rollout beside the demo, in real time, as WebM; lets whatever is more urgent go first.
 
     Args:
@@ -168,6 +169,7 @@ def draw_film(
         qpos: Positions, (L, q).
         frames: Which frame of the demo is beside each, (L,).
         dt: Seconds of a control step.
+        title: Of what is at the right; with one, both sides are named in the picture.
     """
     shown = np.round(np.arange(0, len(qpos) * dt * demo.fps) / demo.fps / dt).astype(int)
     shown = shown[shown < len(qpos)]
@@ -179,7 +181,24 @@ def draw_film(
                 yield side_by_side(_filmed(demo)[0][frames[t]], robot)
 
     with replacing(file, ".webm", sync=False) as half:
-        write_webm(half, pairs(), fps=demo.fps)
+        write_webm(
+            half, (captioned(p, "Demonstration", title) if title else p for p in pairs()), fps=demo.fps
+        )
+
+
+def captioned(picture: np.ndarray, left: str, right: str) -> np.ndarray:
+    """A picture of two sides, (H, W, 3), uint8 RGB, with a word at the foot of each; ASCII alone."""
+    named = picture.copy()
+    height, width, _ = named.shape
+    scale = height / 720
+    for text, start in ((left, 0), (right, width // 2)):
+        place = (start + round(24 * scale), height - round(22 * scale))
+        for colour, thickness in (((255, 255, 255), 5), ((24, 32, 43), 1.6)):
+            cv2.putText(
+                named, text, place, cv2.FONT_HERSHEY_DUPLEX, scale, colour, max(1, round(thickness * scale)),
+                cv2.LINE_AA,
+            )  # fmt: skip
+    return named
 
 
 @lru_cache(1)

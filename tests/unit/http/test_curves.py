@@ -1,6 +1,9 @@
 """Curves over HTTP: for researchers alone, of any run, and what is asked wrongly."""
 
 import asyncio
+import hashlib
+import json
+import tomllib
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +12,7 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from helpers.curves import train
 from helpers.fake_trainer import StandIn
+from helpers.paths import ROOT
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.network.bind import Listening
@@ -48,8 +52,6 @@ def test_only_researchers_get_curves(trainer, role, status):
 
 
 def test_any_run_is_told_of_with_its_own_colour(trainer):
-    import json
-
     trainer.store.runs.add(run="hop-1", demo="hop", demo_sha256="1", seed=1, config="", version="0")
     train(trainer.store, "hop-1", 1, 4)
     (_, here), (_, there), (_, later) = ask(
@@ -74,3 +76,13 @@ def test_a_vendored_file_is_served_and_nothing_beside_it(trainer):
     )  # fmt: skip
     assert [status for status, _ in found] == [200, 404, 404, 404, 404]
     assert "uPlot" in found[0][1]
+
+
+def test_what_is_vendored_is_as_it_was_published():
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["onedemo"]["vendored"]
+    vendor = ROOT / "static" / "vendor"
+    assert {folder.name for folder in vendor.iterdir()} == set(tools)
+    for name, package in tools.items():
+        there = {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in (vendor / name).iterdir()}
+        assert there == package["sha256"] and "LICENSE" in there
+        assert f"v{package['version']}".encode() in (vendor / name / "uPlot.iife.min.js").read_bytes()[:200]

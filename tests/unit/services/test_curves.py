@@ -1,5 +1,7 @@
 """What the charts are told of a run: thinned, with what is worked out from ratings and what happened."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -49,10 +51,12 @@ def test_marks_stand_after_the_iteration_they_came_after(trainer):
     store, run = trainer.store, trainer.run
     ann, bob = (store.accounts.ensure(name, "annotator").id for name in ("Ann", "Bob"))
     store.ratings.leave_out(run, ann, by=bob)
+    time.sleep(0.01)  # the database keeps milliseconds
     train(store, run, 1, 3)
     store.runs.mark(run, 3, "paused")
     store.runs.mark(run, 3, "resumed")
     train(store, run, 4, 5)
+    time.sleep(0.01)
     store.ratings.leave_out(run, ann, by=bob, left_out=False)
     assert curves(store, run)["marks"] == [
         [0, "excluded", "Ann"], [3, "paused", ""], [3, "resumed", ""], [5, "included", "Ann"],

@@ -9,7 +9,7 @@ from onedemo.demos.video import VideoReader, count_frames
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.rollouts import Transitions
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery
-from onedemo.training.pictures import PictureFiles
+from onedemo.training.pictures import PictureFiles, captioned
 from onedemo.types import Rollouts
 from unit.queries.test_selection import rollouts as empty_rollouts
 
@@ -64,6 +64,14 @@ def test_a_long_attempt_is_better_than_a_good_moment():
         for steps, reward in ((10, 0.75), (1000, 0.5))
     )
     assert long.worth > short.worth
+
+
+def test_a_film_says_which_side_is_the_robot():
+    plain = np.full((360, 972, 3), 128, np.uint8)
+    named = captioned(plain, "Demonstration", "Robot, iteration 7")
+    changed = (named != plain).any(axis=2)
+    assert changed[320:, :486].any() and changed[320:, 486:].any() and not changed[:310].any()
+    assert not (plain != 128).any()
 
 
 @pytest.mark.seam

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.small_world import FRAMES, STEPS, falling_states, falling_track, small_config
+from helpers.small_world import FRAME_STEPS, FRAMES, STEPS, falling_states, falling_track, small_config
 from onedemo.errors import UserError
 from onedemo.evaluation.episodes import summarise
 from onedemo.reward.learned_distance import MetricSnapshot
@@ -91,6 +91,39 @@ def test_any_number_of_threads_gives_the_same_policy(features, method):
         ends.append(learner.policy().weights)
     for one, two in zip(*ends, strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+@METHODS
+def test_looking_at_how_it_goes_changes_nothing_that_is_learned(features, method):
+    """To the bit, and whatever else draws from NumPy or torch goes on as it would have."""
+    ends = []
+    for looked in (False, True):
+        learner = make_learner(features, CONFIGS[method]())
+        ratings = rated(learner, 30)
+        snapshot, _ = learner.fit(ratings[:20], 1)
+        np.random.seed(1)
+        torch.manual_seed(1)
+        for _ in range(2):
+            if looked:
+                told = learner.forecast(snapshot, ratings[20:])
+            rollouts, stats = learner.iterate(snapshot)
+            if looked:
+                figures = learner.diagnose(rollouts, snapshot)
+        draws = [np.random.random(), float(torch.rand(1))]
+        ends.append([*learner.policy().weights, np.array([*draws, stats["predicted"], stats["kl"]])])
+    for one, two in zip(*ends, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert told["new"] == 10 and 0 <= told["hits"] <= 10 and 2 <= told["confidence"] <= 10
+    assert learner.forecast(snapshot, []) == {}
+    assert figures["disagreement"] >= 0 and set(learner.seconds) == {"rollouts", "policy"}
+    if method == "paper":
+        assert figures["reference"] is None
+        return
+    # What does exactly as the demo shows is rated best of all.
+    frames = np.arange(0, FRAMES, 7)
+    itself = snapshot.ratings(frames, falling_states().obs[FRAME_STEPS][frames], np.zeros((len(frames), 3)))
+    np.testing.assert_allclose(itself, figures["reference"], atol=1e-3)
+    assert 1 < figures["reference"] <= 5
 
 
 def test_the_random_rollouts_are_the_same_each_time(features):

@@ -123,6 +123,12 @@ def test_every_reward_can_be_traced_to_ratings(store, demo):
         ratings = store.ratings.for_training(run, as_of=snapshot["last_event"])
         assert len(ratings) == snapshot["ratings"] >= 12
         assert (store.path.parent / "runs" / run / "snapshots" / f"{iteration['snapshot']:06d}.pt").exists()
+        assert set(iteration["seconds"]) == {"rollouts", "policy", "refit", "other"}
+        assert iteration["disagreement"] >= 0 and "episode_seconds" in iteration
+    # Each rating was forecast once, but those of before the first predictor.
+    new = [snapshot.get("new", 0) for snapshot in snapshots.values()]
+    assert new[0] == 0 and sum(new) == 18 - snapshots[1]["ratings"]
+    assert all(s["hits"] <= s["new"] for s in snapshots.values() if "new" in s)
     stages = [row[6] for row in store.ratings.stream(run)]
     assert stages.count("pretrain") == 12 and stages.count("online") == 6
 
@@ -190,6 +196,9 @@ def test_people_rate_and_the_trainer_follows(store, demo):
     assert [row["number"] for row in store.runs.iterations("r")] == list(
         range(1, trainer_.status().iteration + 1)
     )
+    marks = store.runs.marks("r")
+    assert [kind for _, kind, _ in marks] == ["paused", "resumed", "stopped", "resumed", "stopped"]
+    assert marks[-1][0] == trainer_.status().iteration
 
 
 def test_after_a_failure_the_page_knows_and_rating_goes_on(store, demo, monkeypatch):
