@@ -46,7 +46,7 @@ def test_a_first_visit_opens_with_the_demo_then_practice(chromium, site, viewpor
     practice = site.page.pictures.chosen().practice
     with opened(chromium, newcomer(site), viewport) as page:
         page.wait_for_selector("[data-introduction] video")
-        page.wait_for_function("() => document.querySelector('[data-introduction] video').currentTime > 0.3")
+        page.wait_for_function("() => document.querySelector('[data-introduction] video')?.currentTime > 0.3")
         assert page.locator("[data-introduction] li").count() == 3
         (button,) = page.locator("[data-introduction] button").all()  # one thing to do
         box = button.bounding_box()
@@ -71,7 +71,7 @@ def test_a_first_visit_opens_with_the_demo_then_practice(chromium, site, viewpor
         page.reload()
         shown_clip(page)  # not again
         page.click('.od-tabs >> text="Guide"')
-        page.wait_for_function("() => document.querySelector('.od-guide video').currentTime > 0.1")
+        page.wait_for_function("() => document.querySelector('.od-guide video')?.currentTime > 0.1")
         shown = page.locator(".od-example figcaption b").all_inner_texts()
         assert shown == sorted(shown) and len(shown) > 2  # in the order of the scale
         page.click("text=Practise again")
