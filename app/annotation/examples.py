@@ -31,10 +31,10 @@ _APART = 8
 """So many frames at least lie between the two sides of an example, unless they are the same."""
 _MOST_DOUBT = 0.45
 """Frames of which the pose estimator is less sure are not compared."""
-_FITS, _OFF = 0.45, 0.95
-"""A part that is nearer than the first fits; one that is further than the second is clearly different."""
-_SINGULAR = ("fits", "is a little off", "is clearly different")
-_PLURAL = ("fit", "are a little off", "are clearly different")
+_STEPS = (0.45, 0.95, 1.6, 2.3)
+"""Distances of a part from which on the next words are said of it."""
+_SINGULAR = ("fits", "is a little off", "differs clearly", "differs a lot", "has nothing in common")
+_PLURAL = ("fit", "are a little off", "differ clearly", "differ a lot", "have nothing in common")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -179,7 +179,7 @@ def _why(rating: int, pose: float, pace: float) -> str:
     """What to say of two clips, from how far apart they are in pose and in pace."""
     if rating == 5:
         return "Both sides show the same moment, so you could take one for the other."
-    one, other = (sum(distance > least for least in (_FITS, _OFF)) for distance in (pose, pace))
+    one, other = (sum(distance > step for step in _STEPS) for distance in (pose, pace))
     if one == other:
         return f"Pose, direction and pace {_PLURAL[one]}."
     return f"The pose {_SINGULAR[one]}; direction and pace {_PLURAL[other]}."

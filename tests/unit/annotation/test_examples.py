@@ -107,7 +107,7 @@ def test_what_is_said_of_an_example_is_what_differs():
     pose = kinematics.pose_of(height, np.stack([same] * 4, -1)).astype(np.float32)
     chosen = choose(Track(pose=pose, motion=np.zeros_like(pose)), 240, LENGTH)
     (example,) = [e for e in chosen.guide if e.rating == 3]
-    assert example.why == "The pose is clearly different; direction and pace fit."
+    assert example.why == "The pose differs clearly; direction and pace fit."
 
 
 def test_moments_that_the_estimator_is_unsure_of_are_left_alone():
