@@ -168,6 +168,7 @@ const page = (() => {
   }
 
   function answer(key) {
+    if (shown("[data-introduction]")) return send({ press: "practise", exercise: 0, do: PRACTICE[key] ?? Number(key) });
     const player = main();
     // Nobody has seen it yet, or it was answered a moment ago and is about to go.
     if (!player?.ready || player.answered) return;

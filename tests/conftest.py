@@ -107,7 +107,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
     trainer = StandIn(tmp_path)
     page = Page(
         trainer,
-        pictures=Pictures(trainer.demo, read=lambda _: trainer.frames),
+        pictures=Pictures(trainer.demo, read=lambda _: trainer.frames, track=lambda: trainer.track),
         again=Again(shared=0, repeated=0),
         guard_seconds=0.05,
         live_fps=2.0,  # without a GPU each frame costs a tenth of a second

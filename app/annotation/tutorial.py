@@ -1,68 +1,58 @@
-"""Two practice clips before the first real one: nothing is stored but that they were done."""
+"""What comes before somebody's first clip: three lines and the whole video, then practice clips.
+
+Nothing is stored but that it was done.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+
+from onedemo.app.annotation.examples import Example
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Exercise:
-    """One practice clip."""
-
-    example: str
-    """Which of the examples (``app/services/demo_images.py``)."""
-    right: tuple[int, ...]
-    """What people would give."""
-    why: str
-    """One sentence."""
-
-
-EXERCISES = (
-    Exercise(
-        example="same",
-        right=(5, 4),
-        why="Both sides show the same moment, so you could take one for the other.",
-    ),
-    Exercise(
-        example="far",
-        right=(1, 2),
-        why="Pose, direction and pace all differ. At first most of what the robot does is like this.",
-    ),
-)
-
-
-@dataclass
 class Lesson:
-    """Somebody's way through the practice clips."""
+    """Somebody's way through introduction and practice.
 
-    index: int = 0
-    answer: int | None = None
-    """What was given to the exercise on screen, None before that."""
-    exercises: tuple[Exercise, ...] = field(default=EXERCISES)
+    Args:
+        offered: Gives the practice clips, as they are known by then.
+    """
+
+    def __init__(self, offered: Callable[[], tuple[Example, ...]]) -> None:
+        self._offered = offered
+        self.begin(introduce=True)
+
+    def begin(self, *, introduce: bool = False) -> None:
+        """From the first practice clip on (again), or from the introduction."""
+        self.exercises = self._offered()
+        self.index = 0 if introduce else 1
+        """What is on screen: 0 is the introduction, n the n-th practice clip."""
+        self.answer: int | None = None
+        """What was given to the practice clip on screen, None before that."""
 
     @property
     def over(self) -> bool:
-        """Whether all of them are done."""
-        return self.index >= len(self.exercises)
+        """Whether all of it is done."""
+        return self.index > len(self.exercises)
 
     @property
-    def exercise(self) -> Exercise:
-        """The one on screen."""
-        return self.exercises[self.index]
+    def introducing(self) -> bool:
+        """Whether the introduction is on screen."""
+        return self.index == 0
 
-    def begin(self) -> None:
-        """From the first one on, (again)."""
-        self.index, self.answer = 0, None
+    @property
+    def exercise(self) -> Example:
+        """The practice clip on screen."""
+        return self.exercises[self.index - 1]
 
     def leave(self) -> None:
         """Does without the rest."""
-        self.index, self.answer = len(self.exercises), None
+        self.index, self.answer = len(self.exercises) + 1, None
 
     def take(self, exercise: int, do: int | str) -> bool:
         """One press.
 
         Args:
-            exercise: Index of the one that was on screen.
+            exercise: What was on screen, as ``index``.
             do: A rating; "next", once there is one; "leave" does without the rest.
 
         Returns:
@@ -72,9 +62,11 @@ class Lesson:
             return False
         if do == "leave":
             self.leave()
+        elif do == "next" and self.introducing:
+            self.begin()
         elif do == "next" and self.answer is not None:
             self.index, self.answer = self.index + 1, None
-        elif isinstance(do, int) and self.answer is None:
+        elif isinstance(do, int) and self.answer is None and not self.introducing:
             self.answer = do
         else:
             return False
@@ -82,9 +74,10 @@ class Lesson:
 
     @property
     def feedback(self) -> str:
-        """What to say of the answer, two sentences."""
-        assert self.answer is not None
-        wanted = " or ".join(str(value) for value in self.exercise.right)
-        if self.answer in self.exercise.right:
-            return f"{self.answer} is right. {self.exercise.why}"
-        return f"You gave {self.answer}; most people would give {wanted}. {self.exercise.why}"
+        """What to say of the answer, two or three sentences."""
+        example, given = self.exercise, self.answer
+        if given == example.rating:
+            return f"{given} is what most people would give. {example.why}"
+        if given in example.right_ratings:
+            return f"{given} is near enough; most people would give {example.rating}. {example.why}"
+        return f"You gave {given}; most people would give {example.rating}. {example.why}"

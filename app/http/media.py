@@ -124,6 +124,13 @@ class Files:
             raise web.HTTPNotFound()
         return web.Response(body=frames[index], content_type="image/jpeg", headers=_KEEP)
 
+    async def demo_video(self, request: web.Request) -> web.StreamResponse:
+        """The whole demo, as it is stored."""
+        path = self._page.pictures.demo.path
+        if not path.is_file():
+            raise web.HTTPNotFound(text="The demonstration's video is gone.")
+        return web.FileResponse(path, headers=_KEEP | {"Content-Type": "video/webm"})
+
     async def demo_example(self, request: web.Request) -> web.StreamResponse:
         """A clip of the guide."""
         examples = await self._of_demo(Pictures.examples)

@@ -150,6 +150,7 @@ class Front:
             Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
             Route("GET", r"/pairs/{pair:\d{1,15}}.jpg", "annotator", files.pair),
             Route("GET", r"/demo/frames/{index:\d{1,6}}.jpg", "annotator", files.demo_frame),
+            Route("GET", "/demo/video.webm", "annotator", files.demo_video),
             Route("GET", r"/demo/examples/{name:[a-z]{1,20}}.jpg", "annotator", files.demo_example),
             Route("GET", r"/rollouts/{iteration:\d{1,9}}.{suffix:jpg|webm}", "researcher", files.rollout),
             Route("GET", "/curves.json", "researcher", self._curves.curves),

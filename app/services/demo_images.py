@@ -9,11 +9,14 @@ import logging
 import threading
 import zlib
 from collections.abc import Callable
+from itertools import groupby
+from operator import attrgetter
 
 import cv2
 import numpy as np
 
-from onedemo.demos.library import read_frames
+from onedemo.app.annotation.examples import Example, Examples, choose
+from onedemo.demos.library import built_in, read_frames
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.render.framing import film_sides
@@ -21,10 +24,13 @@ from onedemo.render.mover import locate
 from onedemo.storage.run_directory import CLIP_FORMAT
 from onedemo.storage.store import Store
 from onedemo.types import Demo
+from onedemo.vision.pose_estimator import Track, shipped_track
 
 _JPEG_QUALITY = 88
 _MAX_WIDTH = 640
 _CLIP_SECONDS = 0.3
+
+_source = attrgetter("source")
 
 _log = logging.getLogger(__name__)
 
@@ -44,11 +50,20 @@ class Pictures:
     Args:
         demo: The demo.
         read: Reads its frames, (n, H, W, 3), uint8 RGB.
+        track: What its frames show of the robot, as soon as that is known; None: not yet, or nothing.
     """
 
-    def __init__(self, demo: Demo, read: Callable[[Demo], np.ndarray] = read_frames) -> None:
+    def __init__(
+        self, demo: Demo, read: Callable[[Demo], np.ndarray] = read_frames,
+        track: Callable[[], Track | None] = lambda: None,
+    ) -> None:  # fmt: skip
         self.demo = demo
         self._read = read
+        self._track, self._choosing = track, threading.Lock()
+        self._shown = shipped_track(demo)
+        self._others = {d.name: d for d in built_in() if d.fps == demo.fps and d.path != demo.path}
+        self._length = min(demo.frames, max(2, round(_CLIP_SECONDS * demo.fps)))
+        self._chosen: Examples | None = None
         self._lock = threading.Lock()
         self._frames: list[bytes] | None = None
         self._examples: dict[str, bytes] = {}
@@ -67,15 +82,26 @@ class Pictures:
             return self._frames
 
     def examples(self) -> dict[str, bytes]:
-        """Clips "same", "near", "other" and "far": the demo beside itself at growing distance.
+        """Pictures of the examples that are chosen, and of those that were, by name.
 
         Raises:
             UserError: As ``frames``.
         """
+        chosen = self.chosen()
         with self._lock:
-            if self._frames is None:
+            if self._frames is None or any(e.name not in self._examples for e in _all_of(chosen)):
                 self._prepare()
             return self._examples
+
+    def chosen(self) -> Examples:
+        """Examples of ratings: few at first, all once it is known what the frames show."""
+        with self._choosing:
+            if self._chosen is None or (self._shown is None and self._track() is not None):
+                self._shown = self._shown or self._track()
+                tracks = {name: shipped_track(demo) for name, demo in self._others.items()}
+                others = {name: track for name, track in tracks.items() if track is not None}
+                self._chosen = choose(self._shown, self.demo.frames, self._length, others)
+            return self._chosen
 
     def _prepare(self) -> None:
         try:
@@ -85,47 +111,22 @@ class Pictures:
                 self._told = True
                 _log.error("%s", error)
             raise
-        length = min(len(frames), max(2, round(_CLIP_SECONDS * self.demo.fps)))
-        moments = example_moments(frames, length=length)
+        length, examples = self._length, dict(self._examples)
         mover = locate(frames)
-        examples = {}
-        for name, other in moments.items():
-            shown = [np.arange(start, start + length) for start in (moments["same"], other)]
-            movers = [mover and mover.at(some) for some in shown]
-            examples[name] = compose_clip(*film_sides([frames[some] for some in shown], movers))
+        for source, wanted in groupby(sorted(_all_of(self._chosen), key=_source), key=_source):
+            there = self._read(self._others[source]) if source else frames
+            mover_there = locate(there) if source else mover
+            for example in wanted:
+                left = np.arange(example.left, example.left + length)
+                right = np.arange(example.right, example.right + length)
+                movers = [mover and mover.at(left), mover_there and mover_there.at(right)]
+                examples[example.name] = compose_clip(*film_sides([frames[left], there[right]], movers))
         self._examples = examples
-        self._frames = [_jpeg(frame) for frame in frames]
+        self._frames = self._frames or [_jpeg(frame) for frame in frames]
 
 
-def example_moments(frames: np.ndarray, *, length: int) -> dict[str, int]:
-    """Where to begin the examples, chosen by how different the pictures are.
-
-    The left side is the liveliest moment of the demo. The right side is the same moment ("same"), the
-    moment that looks most different ("far"), and those a fifth ("near") and half ("other") as different.
-
-    Args:
-        frames: (n, H, W, 3), uint8.
-        length: Frames in a clip, at least 2.
-
-    Returns:
-        First frames, each at most ``n - length``.
-    """
-    last = len(frames) - length
-    small = np.stack([cv2.resize(frame, (40, 30), interpolation=cv2.INTER_AREA) for frame in frames])
-    small = small.reshape(len(frames), -1).astype(np.float32)
-    motion = np.abs(np.diff(small, axis=0)).mean(1)
-    lively = [motion[start : start + length - 1].sum() for start in range(last + 1)]
-    same = int(np.argmax(lively))
-    window = small[same : same + length]
-    distance = np.array([np.abs(small[s : s + length] - window).mean() for s in range(last + 1)])
-    others = np.where(np.arange(last + 1) == same, np.inf, distance)
-    most = distance.max()
-    return {
-        "same": same,
-        "near": int(np.argmin(np.abs(others - most / 5))),
-        "other": int(np.argmin(np.abs(others - most / 2))),
-        "far": int(np.argmax(distance)),
-    }
+def _all_of(examples: Examples | None) -> tuple[Example, ...]:
+    return (*examples.guide, *examples.practice) if examples is not None else ()
 
 
 def _jpeg(frame: np.ndarray) -> bytes:

@@ -11,6 +11,11 @@ def example_address(name: str, sha256: str) -> str:
     return f"demo/examples/{name}.jpg?v={sha256[:8]}-{CLIP_FORMAT}"
 
 
+def video_address(sha256: str) -> str:
+    """Where the whole demo is."""
+    return f"demo/video.webm?v={sha256[:8]}"
+
+
 def player_html(source: str, fps: float, *sides: str) -> str:
     """Canvases onto which a clip is drawn.
 

@@ -1,4 +1,4 @@
-"""The Guide tab: what to look at, what 1 to 5 mean, which keys there are."""
+"""The Guide tab: the whole move, what 1 to 5 mean, what to look at, words and keys."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import threading
 
 from markupsafe import Markup
 
-from onedemo.app.annotation.scale import ANSWERS, MEANINGS
-from onedemo.app.tabs.clip_player import example_address, player_html
+from onedemo.app.annotation.examples import Examples
+from onedemo.app.annotation.scale import ANSWERS, MEANINGS, WORDS
+from onedemo.app.tabs.clip_player import example_address, player_html, video_address
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.tabs.strings import RATE_KEYS
 from onedemo.app.templates import render
 from onedemo.errors import UserError
-from onedemo.types import Status
+from onedemo.types import Demo, Status
 
 log = logging.getLogger("onedemo.page")
 
@@ -25,53 +26,61 @@ class Guide:
 
     def __init__(self, context: TabContext) -> None:
         self._pictures = context.pictures
-        self._html = context.client.gui.add_html(str(guide_html(None)))
-        self._loading = False
+        self._researcher = context.rater.role == "researcher"
+        self._html = context.client.gui.add_html(str(self._drawn_with(None)))
+        self._shown = False
+        self._examples: Examples | None = None
 
     def show(self) -> None:
-        """Fetches the examples the first time, without making anybody wait."""
-        if not self._loading:
-            self._loading = True
-            threading.Thread(target=self._load, name="onedemo-guide", daemon=True).start()
+        """Fetches the examples, without making anybody wait."""
+        self._shown = True
+        self._follow()
 
     def hide(self) -> None:
-        """Nothing to do: it holds nothing."""
+        """Does not look for others any more."""
+        self._shown = False
 
     def refresh(self, status: Status) -> None:
-        """Nothing to do: it does not change."""
+        """There are more examples once the robot was looked at."""
+        if self._shown:
+            self._follow()
 
     def close(self) -> None:
         """Nothing to do: it holds nothing."""
 
-    def _load(self) -> None:
+    def _follow(self) -> None:
+        examples = self._pictures.chosen()
+        if examples is not self._examples:
+            self._examples = examples
+            threading.Thread(target=self._load, args=(examples,), name="onedemo-guide", daemon=True).start()
+
+    def _load(self, examples: Examples) -> None:
         try:
             self._pictures.examples()
-            self._html.content = str(guide_html(self._pictures.demo.fps, self._pictures.demo.sha256))
+            self._html.content = str(self._drawn_with(examples))
         except UserError:  # the demo's video is gone: logged, and said on top of the page
             pass
         except Exception:
             log.exception("the examples of the guide could not be made")
 
-
-_EXAMPLES = (
-    ("same", "5", "The same moment twice."),
-    ("near", "4", "Moments that look nearly alike."),
-    ("other", "2–3", "Moments with something in common."),
-    ("far", "1", "Moments with nothing in common."),
-)
+    def _drawn_with(self, examples: Examples | None) -> Markup:
+        return guide_html(self._pictures.demo, examples, researcher=self._researcher)
 
 
-def guide_html(fps: float | None, sha256: str = "") -> Markup:
+def guide_html(demo: Demo, examples: Examples | None, *, researcher: bool) -> Markup:
     """The whole tab.
 
     Args:
-        fps: Frames per second of the examples; None while they are not made yet.
-        sha256: Of the demo.
+        demo: What is to be learned.
+        examples: Of ratings; None while they are not made yet.
+        researcher: Whether it explains the words of the researcher's tabs, too.
     """
-    examples = [
-        (Markup(player_html(example_address(name, sha256), fps, "both")), rating, text)
-        for name, rating, text in _EXAMPLES
-        if fps is not None
+    cards = [
+        (player_html(example_address(example.name, demo.sha256), demo.fps, "both"), example)
+        for example in (examples.guide if examples is not None else ())
     ]
-    scale = list(zip(ANSWERS, MEANINGS, strict=True))
-    return render("guide.html:guide", scale=scale, examples=examples, keys=RATE_KEYS)
+    words = [(word, text) for word, text, everybody in WORDS if everybody or researcher]
+    return render(
+        "guide.html:guide", scale=list(zip(ANSWERS, MEANINGS, strict=True)), cards=cards, words=words,
+        video=video_address(demo.sha256), loading=examples is None, keys=RATE_KEYS,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The Rate tab: a clip, a question, five answers; before the first real one, two clips to practise with.
+"""The Rate tab: a clip, a question, five answers; before the first one, an introduction and practice clips.
 
 Keys and buttons are the browser's (``static/page.js``): a press comes as a request that names the clip that
 was on screen, however slow the line is. Here it is carried out, and what comes next is drawn.
@@ -12,7 +12,7 @@ from onedemo.app.annotation import presses
 from onedemo.app.annotation.phases import waiting
 from onedemo.app.annotation.rating_session import RatingSession
 from onedemo.app.annotation.scale import ANSWERS, REASONS
-from onedemo.app.tabs.clip_player import example_address
+from onedemo.app.tabs.clip_player import example_address, video_address
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.tabs.pressing import Pressing
 from onedemo.app.tabs.strings import RATE_KEYS, keys_dialog
@@ -141,8 +141,16 @@ class Rate(Pressing):
 
     def _draw_lesson(self) -> None:
         lesson, demo = self._lesson, self._context.demo
-        top = render("rate.html:lesson_top", number=lesson.index + 1, of=len(lesson.exercises))
-        source = example_address(lesson.exercise.example, demo.sha256)
+        if lesson.introducing:
+            clips = len(lesson.exercises)
+            stage = render("rate.html:introduction", video=video_address(demo.sha256), clips=clips)
+            self._put(self._stage, stage)
+            for handle in (self._top, self._tools, self._notice):
+                self._put(handle, "")
+            self._show_answers(False)
+            return
+        top = render("rate.html:lesson_top", number=lesson.index, of=len(lesson.exercises))
+        source = example_address(lesson.exercise.name, demo.sha256)
         self._put(self._top, top)
         self._put(self._stage, render("rate.html:lesson", lesson=lesson, source=source, fps=demo.fps))
         self._put(self._tools, render("player.html:tools", kind="practice", undo=None))

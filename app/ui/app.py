@@ -87,7 +87,7 @@ class Page:
 
     def _attach(self, trainer: Any, pictures: Pictures | None) -> None:
         self.trainer = trainer
-        self.pictures = pictures or Pictures(trainer.demo)
+        self.pictures = pictures or Pictures(trainer.demo, track=lambda: trainer.track)
         self._assignment = Assignment(again=self._again)
         self._pair_assignment = Assignment()
         self._live = Live(trainer.acting, trainer.demo.seconds, frames_per_second=self._live_fps)
@@ -163,13 +163,14 @@ class Page:
         return hmac.compare_digest(headers.get(SECRET_HEADER, "").encode(), self.secret.encode())
 
     def _context(self, client: viser.ClientHandle, rater: Rater, *, dark: bool) -> TabContext:
-        trainer, lesson = self.trainer, Lesson()
+        trainer, pictures = self.trainer, self.pictures
+        lesson = Lesson(lambda: pictures.chosen().practice)
         if trainer.store.accounts.has_practised(rater.id):
             lesson.leave()
         return TabContext(
             client=client, rater=rater, dark=dark, lesson=lesson, store=trainer.store, run=trainer.run,
             version=version_of(trainer.store, trainer.run), data_dir=trainer.data_dir, demo=trainer.demo,
-            dt=trainer.dt, training=trainer, pictures=self.pictures, live=self._live,
+            dt=trainer.dt, training=trainer, pictures=pictures, live=self._live,
             assignment=self._assignment, pair_assignment=self._pair_assignment,
             guard_seconds=self._guard_seconds,
         )  # fmt: skip

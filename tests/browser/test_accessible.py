@@ -39,6 +39,9 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
     new = store.accounts.ensure("new", "annotator")
     practice = issue_link(store, read_secret(store.path.parent), new, site.url)
     with opened(chromium, practice, viewport, color_scheme=scheme) as page:
+        page.wait_for_selector("[data-introduction]")
+        assert_nothing_serious(page, "introduction")
+        page.click("[data-go]")
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
         assert_nothing_serious(page, "practice")
         page.keyboard.press("1")

@@ -52,6 +52,8 @@ def rows(data_dir, columns="clip_id, value"):
 
 def skip_practice(page):
     """Somebody new begins with practice clips."""
+    page.wait_for_selector("[data-introduction]", timeout=90_000)
+    page.click("[data-go]")
     page.wait_for_selector(".od-practice [data-frame]", timeout=90_000)
     page.keyboard.press("s")
 

@@ -22,37 +22,77 @@ def marks_of(site) -> list[tuple]:
     )
 
 
-def test_two_practice_clips_with_feedback_come_before_the_first_real_one(chromium, site):
+def newcomer(site) -> str:
+    """A link of somebody who has never rated."""
     from onedemo.app.http.tokens import issue_link, read_secret
 
     store = site.trainer.store
     new = store.accounts.ensure("new", "annotator")
-    link = issue_link(store, read_secret(store.path.parent), new, site.url)
-    with opened(chromium, link) as page:
-        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
-        page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
+    return issue_link(store, read_secret(store.path.parent), new, site.url)
+
+
+def practice_clip(page, number, of):
+    page.wait_for_selector(f".od-progress >> text=Practice {number} of {of}")
+    page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)
+
+
+@BOTH
+def test_a_first_visit_opens_with_the_demo_then_practice(chromium, site, viewport):
+    from helpers.fake_trainer import drawn_track
+    from onedemo.demos.video import write_webm
+
+    site.trainer.track = drawn_track()
+    write_webm(site.trainer.demo.path, site.trainer.frames[:60], fps=30.0)
+    practice = site.page.pictures.chosen().practice
+    with opened(chromium, newcomer(site), viewport) as page:
+        page.wait_for_selector("[data-introduction] video")
+        page.wait_for_function("() => document.querySelector('[data-introduction] video')?.currentTime > 0.3")
+        assert page.locator("[data-introduction] li").count() == 3
+        (button,) = page.locator("[data-introduction] button").all()  # one thing to do
+        box = button.bounding_box()
+        assert box["y"] + box["height"] <= viewport["height"], "without scrolling"
+        page.keyboard.press("3")  # nothing to rate yet
+        page.keyboard.press("Enter")
+        practice_clip(page, 1, len(practice))
         page.keyboard.press("ArrowRight")  # both sides stand still
         assert np.abs(np.subtract(drawn(page, "left"), drawn(page, "right"))).max() < 40
         page.keyboard.press("2")
-        page.wait_for_selector(".od-feedback >> text=You gave 2; most people would give 5 or 4.")
+        page.wait_for_selector(".od-feedback >> text=You gave 2; most people would give 5.")
         assert not page.locator(".od-answers").is_visible()
         page.keyboard.press("Enter")
-        page.wait_for_selector(".od-progress >> text=Practice 2 of 2")
-        page.wait_for_selector(".od-practice .od-player[data-frame]", timeout=60_000)
-        page.click('.od-answers [data-key="1"]')
-        page.wait_for_selector(".od-feedback >> text=1 is right.")
-        page.click("[data-go]")
+        for number, example in enumerate(practice[1:], start=2):
+            practice_clip(page, number, len(practice))
+            page.click(f'.od-answers [data-key="{example.rating}"]')
+            page.wait_for_selector(f".od-feedback >> text={example.rating} is what most people would give.")
+            page.click("[data-go]")
         clip = shown_clip(page)
         assert site.events() == []
         assert press_and_wait(page, site, lambda: page.keyboard.press("3")) == ("rate", clip, 3, "new")
         page.reload()
         shown_clip(page)  # not again
         page.click('.od-tabs >> text="Guide"')
+        page.wait_for_function("() => document.querySelector('.od-guide video')?.currentTime > 0.1")
+        shown = page.locator(".od-example figcaption b").all_inner_texts()
+        assert shown == sorted(shown) and len(shown) > 2  # in the order of the scale
         page.click("text=Practise again")
-        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
+        practice_clip(page, 1, len(practice))  # without the introduction
         page.keyboard.press("s")
         shown_clip(page)
         assert len(site.events()) == 1
+
+
+def test_more_examples_come_once_the_robot_was_looked_at(chromium, site):
+    from helpers.fake_trainer import drawn_track
+
+    with opened(chromium, newcomer(site)) as page:
+        page.wait_for_selector("[data-introduction] button >> text=Practise")
+        page.click('.od-tabs >> text="Guide"')
+        page.wait_for_selector(".od-example .od-player[data-frame]", timeout=60_000)
+        assert page.locator(".od-example").count() == 1
+        site.trainer.track = drawn_track()
+        page.wait_for_function("() => document.querySelectorAll('.od-example').length > 2")
+        page.click("text=Practise again")
+        practice_clip(page, 1, 5)
 
 
 def test_slow_motion_steps_and_replay(chromium, site):
@@ -252,7 +292,7 @@ def test_letters_of_other_scripts_are_keys_by_their_place_and_latin_ones_by_thei
         type_key(page, "Digit2", "é", 50, modifiers=1)  # Alt: the second tab
         page.wait_for_selector('.od-header[data-tab="guide"]')
         type_key(page, "KeyA", "ф", 65, modifiers=1)
-        page.wait_for_selector(".od-progress >> text=Practice 1 of 2")
+        page.wait_for_selector(".od-progress >> text=Practice 1 of 1")
 
 
 def type_key(page, code, key, number, modifiers=0):

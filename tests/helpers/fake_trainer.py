@@ -7,6 +7,7 @@ import threading
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,9 @@ from onedemo.rl.rollouts import Acting, EpisodeRules
 from onedemo.storage.clips import NewClip
 from onedemo.storage.store import Store
 from onedemo.types import Clip, Demo, Segment, Status
+
+if TYPE_CHECKING:
+    from onedemo.vision.pose_estimator import Track
 
 FPS = 30.0
 SIZE = (360, 480)
@@ -45,6 +49,18 @@ def clip_picture(start: int, *phases: float) -> bytes:
 
     demo = drawn_frames(DEMO_FRAMES)[start : start + 10]
     return compose_clip(demo, *(drawn_frames(10, phase) for phase in phases))
+
+
+def drawn_track() -> Track:
+    """What ``drawn_frames`` of the demo show, as if the stick were a robot."""
+    from onedemo.sim import kinematics
+    from onedemo.vision.pose_estimator import Track
+
+    spin = 2 * np.pi / 60 * FPS
+    angles = np.repeat(spin / FPS * np.arange(DEMO_FRAMES)[:, None], 4, axis=1)
+    pose = kinematics.pose_of(np.full(DEMO_FRAMES, 1.2), angles)
+    motion = kinematics.motion_of(np.zeros(DEMO_FRAMES), angles, np.full_like(angles, spin))
+    return Track(pose=pose.astype(np.float32), motion=motion.astype(np.float32))
 
 
 class Wobble:
@@ -86,6 +102,7 @@ class StandIn:
             total_steps=2_000_000,
         )
         self.calls: list[str] = []
+        self.track: Track | None = None
         self.add_clips(clips)
 
     def add_clips(self, count: int) -> list[int]:

@@ -278,8 +278,9 @@ async def stocked(data_dir: Path, *, people: int, settings: Sequence[str] = ()) 
         async with browser_session() as session:
             tabs = [await open_tab(session, server.links["annotator"])]
             await give(tabs[0], 10)
-            await bring(session, server, "paused")
             run = store.runs.all()[-1]["id"]
+            await reach(lambda: store.runs.last_iteration(run) is not None, "clips of the policy")
+            await bring(session, server, "paused")
             await reach(lambda: len(store.clips.waiting(run)) > queue / 2, "clips that are drawn")
             yield Stocked(server, store, session, tabs, before)
             for tab in tabs:

@@ -14,6 +14,8 @@ import pytest
 import viser
 
 from helpers.beside_playwright import run
+from helpers.fake_trainer import DEMO_FRAMES
+from onedemo.app.annotation.examples import choose
 from onedemo.app.dataset import csv_writer
 from onedemo.app.http.auth import AccessControl
 from onedemo.app.http.server import Front
@@ -80,8 +82,9 @@ def test_nothing_without_a_session(site, path):
     assert fetch(site.url, path, cookies={f"onedemo-{site.front.port}-1": "guess"})[0] == 401
 
 
+EXAMPLE = choose(None, DEMO_FRAMES, 9).guide[0].name
 EXAMPLES = {
-    "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": "far", "iteration": "1", "suffix": "jpg",
+    "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": EXAMPLE, "iteration": "1", "suffix": "jpg",
 }  # fmt: skip
 """What the places in a route's path may be; the rater is the annotator."""
 STRANGERS_MAY = {
@@ -91,7 +94,8 @@ STRANGERS_MAY = {
 ANNOTATORS_MAY = {"/", "/r/2", "/r/2/", "/r/2/press", "/r/2/signout"} | {
     place + path
     for path in (
-        "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg", "/demo/examples/far.jpg",
+        "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
+        f"/demo/examples/{EXAMPLE}.jpg", "/demo/video.webm",
     )
     for place in ("", "/r/2")
 }  # fmt: skip
@@ -207,7 +211,7 @@ def test_clips_of_the_run_and_nothing_else(site):
     ):
         assert fetch(site.url, path, link=link)[0] == 404, path
     assert fetch(site.url, "/demo/frames/3.jpg", link=link)[2][:2] == b"\xff\xd8"
-    assert fetch(site.url, "/demo/examples/far.jpg", link=link)[2][:4] == b"\xff\xd8\xff\xe0"
+    assert fetch(site.url, f"/demo/examples/{EXAMPLE}.jpg", link=link)[2][:4] == b"\xff\xd8\xff\xe0"
 
 
 def test_export_is_for_researchers(site):

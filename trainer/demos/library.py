@@ -293,6 +293,11 @@ def list_demos(demos_dir: Path) -> list[Demo]:
     return sorted((demo for demo, _ in _load_all(Path(demos_dir))), key=lambda demo: demo.name)
 
 
+def built_in() -> list[Demo]:
+    """The demos that come with the program, by name."""
+    return [demo for demo in list_demos(BUILT_IN / "none") if demo.path.parent == BUILT_IN]
+
+
 def is_whole(demo: Demo) -> bool:
     """Whether the stored video is, to the byte, what was stored."""
     about = demo.path.with_name(_ABOUT) if demo.path.name == _VIDEO else demo.path.with_suffix(".json")

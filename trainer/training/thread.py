@@ -16,6 +16,7 @@ from onedemo.core.cpu import give_way
 from onedemo.errors import in_words
 from onedemo.training.training_run import TrainingRun
 from onedemo.types import HALTED, Status
+from onedemo.vision.pose_estimator import Track
 
 log = logging.getLogger("onedemo")
 
@@ -122,6 +123,11 @@ class Trainer:
         with self._control:
             self._released = True
             self._let_go()
+
+    @property
+    def track(self) -> Track | None:
+        """What the demo shows of the robot, as far as is known; None if not yet, or if it shows none."""
+        return self._training.track
 
     def status(self) -> Status:
         """What the thread is doing, as of now."""

@@ -27,6 +27,7 @@ from onedemo.core.names import check_name
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.sim import kinematics, vector_env
+from onedemo.types import Demo
 from onedemo.vision.encoders import Encoder
 
 _SEED = 20_000
@@ -56,6 +57,8 @@ class Track:
     """(F, P), float32, as ``body.pose``."""
     motion: np.ndarray
     """(F, P), float32, as ``body.motion``."""
+    doubt: np.ndarray | None = None
+    """How unsure the pose is, (F,), float32: 0 is sure, 1 may be any; None: not said."""
 
 
 class PoseEstimator:
@@ -98,11 +101,35 @@ class PoseEstimator:
         poses = self.poses(features)
         height = _smooth(poses[:, 0] / kinematics.HEIGHT_SCALE)
         waves = poses[:, 1:].reshape(len(poses), -1, 2)
+        short = 1 - np.minimum(np.linalg.norm(waves, axis=-1), 1)  # an unsure mean lies inside the circle
         angles = _smooth(np.unwrap(np.arctan2(waves[..., 0], waves[..., 1]), axis=0))
         motion = kinematics.motion_of(_rate(height, fps), angles, _rate(angles, fps))
         return Track(
-            pose=kinematics.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32)
-        )
+            pose=kinematics.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
+            doubt=np.linalg.norm(short, axis=-1).astype(np.float32),
+        )  # fmt: skip
+
+
+def shipped_track(demo: Demo) -> Track | None:
+    """What a demo that comes with the program shows of the robot, as ``keep_track`` left it beside its video.
+
+    So examples of ratings can be chosen before the robot was looked at. None for any other demo.
+    """
+    if (data := read_whole(_track_file(demo))) is None:
+        return None
+    with np.load(io.BytesIO(data), allow_pickle=False) as stored:
+        return Track(pose=stored["pose"], motion=stored["motion"], doubt=stored["doubt"])
+
+
+def keep_track(demo: Demo, track: Track) -> None:
+    """Keeps what a demo shows of the robot beside its video."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, pose=track.pose, motion=track.motion, doubt=track.doubt)
+    write_atomic(_track_file(demo), buffer.getvalue())
+
+
+def _track_file(demo: Demo) -> Path:
+    return demo.path.with_suffix(".track.npz")
 
 
 def _go_on(share: float) -> None:

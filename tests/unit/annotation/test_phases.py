@@ -34,7 +34,7 @@ def test_every_phase_says_what_is_awaited_and_what_one_can_do(phase, researcher)
         if phase in HALTS and "Watch" in words:
             assert researcher  # an annotator has no such tab
         if phase in ("stopped", "stopping") and used < 14:
-            assert "resume" in said.advice
+            assert "esume it" in said.advice
         pairs = waiting_for_pairs(state, researcher=researcher)
         assert pairs.text and (phase not in ("stopped", "stopping") or "stopped" in pairs.title)
 

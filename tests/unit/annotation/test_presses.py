@@ -7,6 +7,7 @@ import json
 import pytest
 
 from onedemo.app.annotation import presses
+from onedemo.app.annotation.examples import Example
 from onedemo.app.annotation.presses import read_press
 from onedemo.app.annotation.tutorial import Lesson
 
@@ -56,13 +57,38 @@ def test_what_is_no_json_is_refused(body):
         read_press(body)
 
 
-def test_the_practice_is_gone_through_by_presses_that_name_the_exercise():
-    lesson = Lesson()
-    assert not lesson.take(0, "next") and not lesson.take(1, 3)
-    assert lesson.take(0, 5) and lesson.answer == 5
-    assert not lesson.take(0, 4)  # once
-    assert lesson.take(0, "next") and not lesson.take(0, "next")
-    assert lesson.take(1, 1) and lesson.take(1, "next") and lesson.over
-    assert not lesson.take(2, 1)
-    lesson.begin()
-    assert not lesson.over and lesson.take(0, "leave") and lesson.over
+def clips(*ratings):
+    return tuple(Example(left=9 * n, right=40 + 9 * n, rating=r, why="So.") for n, r in enumerate(ratings))
+
+
+def test_introduction_and_practice_are_gone_through_by_presses_that_name_them():
+    lesson = Lesson(lambda: clips(5, 1))
+    assert lesson.introducing and not lesson.take(0, 3) and not lesson.take(1, 3)
+    assert lesson.take(0, "next") and not lesson.introducing
+    assert not lesson.take(1, "next") and not lesson.take(2, 3)
+    assert lesson.take(1, 5) and lesson.answer == 5
+    assert not lesson.take(1, 4)  # once
+    assert lesson.take(1, "next") and not lesson.take(1, "next")
+    assert lesson.take(2, 1) and lesson.take(2, "next") and lesson.over
+    assert not lesson.take(3, 1)
+    lesson.begin()  # again: without the introduction
+    assert not lesson.over and not lesson.introducing and lesson.take(1, "leave") and lesson.over
+
+
+def test_practice_takes_the_clips_that_are_known_when_it_begins():
+    known = clips(5)
+    lesson = Lesson(lambda: known)
+    known = clips(5, 1, 3)
+    assert lesson.take(0, "next") and len(lesson.exercises) == 3
+
+
+def test_feedback_says_what_is_true_of_the_answer():
+    lesson = Lesson(lambda: clips(3))
+    for given, said in (
+        (3, "3 is what most people would give."),
+        (4, "4 is near enough; most people would give 3."),
+        (1, "You gave 1; most people would give 3."),
+    ):
+        lesson.begin()
+        lesson.take(1, given)
+        assert lesson.feedback == f"{said} So."

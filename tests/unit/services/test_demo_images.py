@@ -20,7 +20,7 @@ def test_a_video_that_is_gone_leaves_one_line_in_the_log(tmp_path, caplog):
     """Pages ask for hundreds of pictures; each left a traceback of 30 lines."""
     demo = replace(find_demo("hopper-hop", Path("nowhere")), path=tmp_path / "gone" / "video.webm")
     files = Files(SimpleNamespace(pictures=Pictures(demo)))
-    asked = SimpleNamespace(match_info={"index": "3", "name": "same"})
+    asked = SimpleNamespace(match_info={"index": "3", "name": "axa"})
 
     async def ask():
         for handler in [files.demo_frame, files.demo_example] * 50:

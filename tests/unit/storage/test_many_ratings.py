@@ -103,7 +103,7 @@ def test_the_data_tab_shows_the_tallies(store):
         set(),
     )  # fmt: skip
     assert "500 given: 500 used for training" in html
-    row = '<th scope="row">rater 3</th><td>pretrain</td>'
+    row = '<th scope="row">rater 3</th><td>before practice</td>'
     cells = store.ratings.tallies(_RUN)["rater 3", "pretrain"]
     assert row + "".join(f"<td>{cell or '·'}</td>" for cell in cells) + f"<td><b>{sum(cells)}</b>" in html
     assert sum(cells) == 4
