@@ -160,7 +160,7 @@ def test_on_a_phone_everything_of_data_and_people_is_in_reach(chromium, site):
             ), boxes
         # What disagreement there is, is looked at with the clip, both names and both ratings.
         page.locator("[data-clip-look]").first.click()
-        both = page.locator(".od-both[open]")
+        both = page.locator(".od-dispute[open]")
         both.locator(".od-player[data-frame]").wait_for()
         assert both.locator(".od-opinions > div").count() == 2 and "Clip " in both.inner_text()
         box = both.bounding_box()
