@@ -102,7 +102,7 @@
 
   // A clip that people disagree on, with what each of them said.
   function compare(button) {
-    const dialog = document.querySelector(".od-both");
+    const dialog = document.querySelector(".od-dispute");
     const { clipLook: clip } = button.dataset;
     dialog.querySelector("h2").textContent = `Clip ${clip}`;
     dialog.querySelector(".od-about").textContent = "";
