@@ -84,6 +84,7 @@ const clips = (() => {
     }
 
     draw() {
+      this.element.toggleAttribute("data-still", !this.playing);
       if (!this.ready) return;
       const frame = this.frame;
       if (this.box && this.clip) this.drawBar();

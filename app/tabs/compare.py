@@ -32,7 +32,8 @@ class Compare(Pressing):
         )  # fmt: skip
         self._message = ""
         gui = context.client.gui
-        self._top, self._stage = gui.add_html(""), gui.add_html("")
+        self._notice, self._top = gui.add_html(""), gui.add_html("")
+        self._stage = gui.add_html("")
         self._answers, self._tools = gui.add_html(""), gui.add_html("")
         gui.add_html(keys_dialog(COMPARE_KEYS))
 
@@ -81,6 +82,10 @@ class Compare(Pressing):
             else:
                 stage = render("compare.html:waiting", message=self._message)
             self._put(self._stage, stage)
+            notice = render(
+                "compare.html:notice", skipped=self._comparing.skipped, taken_back=self._comparing.taken_back
+            )
+            self._put(self._notice, notice)
             self._put(self._answers, render("compare.html:answers") if shown else "")
             self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))
 

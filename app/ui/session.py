@@ -77,7 +77,8 @@ class Session:
                 self._tabs[index].show()
                 header = render(
                     "session.html:header", titles=[tab.title for tab in self._tabs], shown=index,
-                    demo=self._context.demo.name, name=self.rater.name, page=self.token,
+                    run=self._context.run, demo=self._context.demo.name, name=self.rater.name,
+                    page=self.token,
                 )  # fmt: skip
                 self._header.content = str(header)
 

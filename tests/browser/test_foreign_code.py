@@ -202,6 +202,7 @@ def test_the_page_needs_nothing_that_its_policy_forbids(chromium, site):
             page.click(".od-filter >> text=Preview")
             page.wait_for_selector(".od-preview >> text=cannot be filtered")
             assert page.locator(".od-preview *").count() == 0
+    page.click(".od-account")
     page.click("text=Sign out")
     page.wait_for_selector("text=You are signed out")
     assert page.url == f"{site.url}/signed-out"
