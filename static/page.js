@@ -319,7 +319,7 @@ const page = (() => {
   });
 
   // The slider says nothing until it is moved, or pressed where it stands.
-  let slid = null; // the player beside which it was
+  let beside = null; // the clip that is on screen, or the slider alone
   function setSlider(moved) {
     const slide = shown(".od-slide");
     if (!slide) return;
@@ -372,9 +372,9 @@ const page = (() => {
   // Another clip: the slider says nothing again, nor does the time bar what it is for.
   new MutationObserver(() => {
     const slide = shown(".od-slide");
-    const now = slide && (main()?.element ?? slide);
-    if (now === slid) return;
-    slid = now;
+    const now = slide && (shown(".od-clip > [data-src]") ?? slide);
+    if (now === beside) return;
+    beside = now;
     setSlider(false);
     document.documentElement.toggleAttribute("data-knows-marks", KNOWS_MARKS in localStorage);
   }).observe(document.documentElement, { childList: true, subtree: true });

@@ -412,6 +412,8 @@ def test_everything_can_be_done_with_the_keyboard_and_the_focus_is_seen(chromium
             if name:
                 reached.add(name.split(" ")[0])
                 assert outline != "none", name
+            if name == "Rating":
+                page.keyboard.press("ArrowRight")  # until then there is nothing to submit
             if name.startswith("4") and not site.events():
                 press_and_wait(page, site, lambda: page.keyboard.press("Enter"))
                 assert site.events() == [("rate", clip, 4, "bo")]
