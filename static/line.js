@@ -87,7 +87,11 @@ const line = (() => {
     card("This page is closed", [text, "What you have answered so far is kept."]);
   }
 
+  // Whether nothing that is pressed now would reach anybody.
+  const lost = () => Boolean(over || document.querySelector(DIMMED));
+
   async function look() {
+    document.documentElement.toggleAttribute("data-lost", lost());
     if (over) return;
     const now = performance.now();
     const opened = document.querySelector(".od-header");
@@ -193,5 +197,5 @@ const line = (() => {
       });
   });
 
-  return { Closed, answers, during, ended, request, settings, unanswered };
+  return { Closed, answers, during, ended, lost, request, settings, unanswered };
 })();

@@ -14,10 +14,16 @@ const page = (() => {
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
+  // Viser sorts Gaussian splats with functions that it makes of text, which the policy of the page refuses, and
+  // loads that sorter with every page. No splats are drawn here: it waits for its code for ever.
+  const fetchAnything = window.fetch.bind(window);
+  window.fetch = (what, ...options) =>
+    String(what).startsWith("data:application/wasm") ? new Promise(() => {}) : fetchAnything(what, ...options);
+
   const shown = (selector) => document.querySelector(selector);
 
   function typing(target) {
-    return target instanceof Element && target.closest("input, textarea, select, [contenteditable=true]");
+    return target instanceof Element && target.closest("input:not([type=range]), textarea, select, [contenteditable=true]");
   }
 
   // What a key means: its label, but digits by their place, as French keyboards have them with Shift, and
@@ -38,12 +44,15 @@ const page = (() => {
     );
   }
 
-  // Shows which answer was pressed, for a moment or until it is known whether it counted.
-  function flash(key, sent) {
+  // Shows which answer is on its way, and for a moment that the server has taken it.
+  async function flash(key, sent) {
     const button = shown(`.od-answers [data-key="${CSS.escape(key)}"]`);
-    if (!button) return;
-    button.classList.add("od-pressed");
-    Promise.all([sent, new Promise((go) => setTimeout(go, 180))]).then(() => button.classList.remove("od-pressed"));
+    button?.classList.add("od-sent");
+    const counted = await sent;
+    button?.classList.remove("od-sent");
+    if (!counted) return;
+    button?.classList.add("od-pressed");
+    setTimeout(() => button?.classList.remove("od-pressed"), 250);
   }
 
   class Refused extends Error {}
@@ -83,6 +92,7 @@ const page = (() => {
   }
 
   const NOT_YET = "Not saved yet: the server does not answer. Your answer is kept here and sent again.";
+  const NOT_TAKEN = "Not taken: there is no connection. Please answer once it is back.";
 
   // Presses without an answer, oldest first. They outlive a reload of the page.
   const PRESSES = `onedemo-presses-${new URL(".", location.href).pathname}`; // of the person, whatever the tab
@@ -155,6 +165,7 @@ const page = (() => {
     return null;
   }
 
+  const KNOWS_MARKS = "onedemo-knows-marks";
   const PAIR = { 1: "left", 2: "equal", 3: "right", s: "skip" };
   const DOUBLE_MS = 600;
   const PRACTICE = { g: "next", s: "leave" };
@@ -172,6 +183,7 @@ const page = (() => {
     const player = main();
     // Nobody has seen it yet, or it was answered a moment ago and is about to go.
     if (!player?.ready || player.answered) return;
+    if (line.lost()) return say(NOT_TAKEN);
     const { dataset } = player.element;
     const press = meant(key, dataset, player.mark);
     if (!press) return;
@@ -179,8 +191,9 @@ const page = (() => {
     const sent = send(press);
     flash(key, sent);
     sent.then((counted) => {
-      if (counted) forget(player.clip);
-      else player.answered = false;
+      if (!counted) return (player.answered = false);
+      forget(player.clip);
+      localStorage.setItem(KNOWS_MARKS, "yes"); // what the bar is for was said once, beside this clip
     });
   }
 
@@ -195,6 +208,7 @@ const page = (() => {
     const { clip, pair } = player?.answered && !player.undone ? player.element.dataset : {};
     const { undoClip = clip, undoPair = pair } = clip || pair ? {} : (button?.dataset ?? {});
     if (!undoPair && !undoClip) return;
+    if (line.lost()) return say(NOT_TAKEN);
     const press = undoPair
       ? { press: "compare", pair: Number(undoPair), answer: "undo" }
       : { press: "undo", clip: Number(undoClip) };
@@ -213,6 +227,7 @@ const page = (() => {
     if (key === "?") shown(".od-help")?.showModal();
     else if (!player) return false;
     else if (key === " ") player.replay();
+    else if (key === "play") player.playing ? player.seek(player.frame) : player.replay();
     else if (key === "f" || key === "F") toggleSlow();
     else if (key === "t" || key === "T") toggleTrail();
     else if (key === "ArrowLeft") player.seek(player.frame - 1);
@@ -225,8 +240,14 @@ const page = (() => {
   window.addEventListener(
     "keydown",
     (event) => {
-      if (typing(event.target) || event.ctrlKey || event.metaKey || event.getModifierState("AltGraph")) return;
+      if (typing(event.target) || event.getModifierState("AltGraph")) return;
       const name = labelled(event);
+      if (event.ctrlKey || event.metaKey) {
+        const undoes = name.toLowerCase() === "z" && !event.shiftKey && !event.altKey && !shown(".od-help[open]");
+        if (!undoes || !main() && !shown("[data-undo-clip], [data-undo-pair]")) return;
+        event.preventDefault();
+        return event.repeat ? undefined : undo(event);
+      }
       const stop = () => {
         event.stopImmediatePropagation();
         event.preventDefault();
@@ -247,7 +268,7 @@ const page = (() => {
         return;
       }
       const arrows = name.startsWith("Arrow");
-      if (arrows && event.target.closest?.("[role=slider], [role=tablist]")) return;
+      if (arrows && event.target.closest?.("input, [role=tablist]")) return;
       const key = name === "Backspace" ? "u" : name.toLowerCase();
       if (/^[1-5su]$/.test(key) && event.key !== "?") {
         event.preventDefault();
@@ -280,6 +301,7 @@ const page = (() => {
     else if (data.key === "u") undo(event);
     else if (data.key) answer(data.key);
     else if ("replay" in data) local(" ");
+    else if ("play" in data) local("play");
     else if ("slow" in data) local("f");
     else if ("trail" in data) local("t");
     else if ("step" in data) local(data.step === "1" ? "ArrowRight" : "ArrowLeft");
@@ -292,12 +314,24 @@ const page = (() => {
       );
     else if ("unmark" in data) main()?.setMark(null);
     else if ("reason" in data) sayWhy(button.closest(".od-notice"), data.reason);
-    else if ("submit" in data) {
-      // What is on screen is what is rated: slider messages are throttled and may come too late.
-      const thumb = shown(".mantine-Slider-thumb");
-      if (thumb) answer(thumb.getAttribute("aria-valuenow"));
-    }
+    else if ("submit" in data) answer(shown(".od-slide input").value);
   });
+
+  // The slider says nothing until it is moved, or pressed where it stands.
+  let beside = null; // the clip that is on screen, or the slider alone
+  function setSlider(moved) {
+    const slide = shown(".od-slide");
+    if (!slide) return;
+    const input = slide.querySelector("input");
+    slide.toggleAttribute("data-moved", moved);
+    if (!moved) input.value = (Number(input.min) + Number(input.max)) / 2;
+    input.setAttribute("aria-valuetext", moved ? input.value : "not set");
+    shown("[data-submit]").disabled = !moved;
+  }
+  for (const event of ["input", "pointerup"])
+    document.addEventListener(event, ({ target }) => {
+      if (target instanceof Element && target.matches(".od-slide input")) setSlider(true);
+    });
 
   // A reason of one's own, by Enter.
   document.addEventListener("keydown", (event) => {
@@ -311,6 +345,7 @@ const page = (() => {
     const player = track && main();
     if (!player?.ready) return;
     event.preventDefault();
+    localStorage.setItem(KNOWS_MARKS, "yes");
     const box = track.getBoundingClientRect();
     const at = (e) => Math.max(0, Math.min(player.frames - 1e-6, ((e.clientX - box.left) / box.width) * player.frames));
     const start = at(event);
@@ -333,10 +368,15 @@ const page = (() => {
     addEventListener("pointercancel", up);
   });
 
-  // Viser gives its slider no name.
-  new MutationObserver(() =>
-    shown('.mantine-Slider-thumb:not([aria-label="Rating"])')?.setAttribute("aria-label", "Rating"),
-  ).observe(document.documentElement, { childList: true, subtree: true });
+  // Another clip: the slider says nothing again, nor does the time bar what it is for.
+  new MutationObserver(() => {
+    const slide = shown(".od-slide");
+    const now = slide && (shown(".od-clip > [data-src]") ?? slide);
+    if (now === beside) return;
+    beside = now;
+    setSlider(false);
+    document.documentElement.toggleAttribute("data-knows-marks", KNOWS_MARKS in localStorage);
+  }).observe(document.documentElement, { childList: true, subtree: true });
 
   watchPlayers();
 

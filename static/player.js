@@ -100,6 +100,7 @@ const clips = (() => {
     }
 
     draw() {
+      this.element.toggleAttribute("data-still", !this.playing);
       if (!this.ready) return;
       const { frame, labels } = this;
       const pace = `${this.pace}`;

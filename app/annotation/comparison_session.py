@@ -46,18 +46,25 @@ class ComparisonSession:
         """The pair on screen, None while there is none."""
         self.upcoming: int | None = None
         """The pair after it, to be fetched ahead."""
+        self.skipped = False
+        """Whether the last press skipped a pair."""
+        self.taken_back: str | None = None
+        """What was said of the pair on screen before it was taken back."""
 
     @property
     def undoable(self) -> int | None:
         """The pair whose answer may be taken back: the last one of this rater, at whatever page."""
-        return self._store.comparisons.last_compared(self._run, self._rater.id)
+        last = self._store.comparisons.last_compared(self._run, self._rater.id)
+        return last[0] if last else None
 
     def refill(self) -> bool:
         """Looks for pairs if none is on screen or at hand; returns whether anything changed."""
         with self._lock:
             before = self.current, self.upcoming
             if self.current is None:
+                skipped = self.skipped
                 self._advance()
+                self.skipped = skipped and self.current is None
             elif self.upcoming is None:
                 self.upcoming = self._pick()
             return before != (self.current, self.upcoming)
@@ -90,6 +97,7 @@ class ComparisonSession:
                 self._advance()
             except sqlite3.Error:  # the answer is kept all the same; `refill` looks again
                 log.exception("no next pair could be looked for")
+            self.skipped = answer == "skip"
             return True
 
     def undo(self, pair: int) -> bool:
@@ -99,13 +107,15 @@ class ComparisonSession:
             sqlite3.Error: If it could not be committed.
         """
         with self._lock:
-            if pair != self._store.comparisons.last_compared(self._run, self._rater.id):
+            last = self._store.comparisons.last_compared(self._run, self._rater.id)
+            if last is None or last[0] != pair:
                 return False
             self._store.comparisons.compare(pair, self._rater.id, "undo", 0)
             if self.upcoming is not None and self.current is not None:
                 self._assignment.release(self._holder, self.upcoming)
             self.upcoming = self.current or self.upcoming
             self._show(pair)
+            self.taken_back = last[1]
             return True
 
     def close(self) -> None:
@@ -127,5 +137,6 @@ class ComparisonSession:
 
     def _show(self, pair: int | None) -> None:
         self.current, self._shown_at = pair, self._clock()
+        self.skipped, self.taken_back = False, None
         if pair is not None:
             self._assignment.hold(self._holder, pair, now=self._shown_at)

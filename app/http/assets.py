@@ -38,7 +38,9 @@ _DIGITS = "!#$%()*+,-./0123456789:;=?@ABCDEFGHIJKLMNOPQRSTUVWXYZ[\\]^_abcdefghij
 
 
 def page_html() -> str:
-    """Viser's page with our title, icon, style sheet and key handling.
+    """Viser's page with our title, icon, style sheets and scripts, which run before its own.
+
+    Its body begins before Viser's script: what is said while that loads can be seen.
 
     Raises:
         ValueError: If this version of Viser writes its head in another way.
@@ -47,9 +49,11 @@ def page_html() -> str:
     start, icon, rest = html.partition('<link\n      rel="icon"')
     _, end_of_icon, rest = rest.partition("/>")
     before, title, after = rest.partition("<title>Viser</title>")
-    if not (icon and end_of_icon and title):
-        raise ValueError("Viser's page has changed: no icon or title where they were")
-    return "".join((start, before, render("head.html"), after))
+    script, end_of_head, body = after.partition("</head>")
+    _, start_of_body, body = body.partition("<body>")
+    if not (icon and end_of_icon and title and end_of_head and start_of_body):
+        raise ValueError("Viser's page has changed: no icon, title or body where they were")
+    return "".join((start, before, render("head.html"), script, body))
 
 
 @cache

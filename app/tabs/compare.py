@@ -33,7 +33,8 @@ class Compare(Pressing):
         )  # fmt: skip
         self._status = context.training.status()
         gui = context.client.gui
-        self._top, self._stage = gui.add_html(""), gui.add_html("")
+        self._notice, self._top = gui.add_html(""), gui.add_html("")
+        self._stage = gui.add_html("")
         self._answers, self._tools = gui.add_html(""), gui.add_html("")
         gui.add_html(keys_dialog(COMPARE_KEYS))
 
@@ -83,6 +84,10 @@ class Compare(Pressing):
                 told = waiting_for_pairs(self._status, researcher=context.rater.role == "researcher")
                 stage = render("parts.html:waiting", told=told)
             self._put(self._stage, stage)
+            notice = render(
+                "compare.html:notice", skipped=self._comparing.skipped, taken_back=self._comparing.taken_back
+            )
+            self._put(self._notice, notice)
             self._put(self._answers, render("compare.html:answers") if shown else "")
             self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))
 

@@ -20,8 +20,6 @@ from onedemo.app.templates import render
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import Status
 
-_MIDDLE = 3
-
 
 class Rate(Pressing):
     """The Rate tab of one session."""
@@ -37,7 +35,6 @@ class Rate(Pressing):
             dt=context.dt, demo=context.demo, guard_seconds=context.guard_seconds,
         )  # fmt: skip
         self._status: Status = context.training.status()
-        self._clip: int | None = None
         gui = context.client.gui
         self._notice, self._top = gui.add_html(""), gui.add_html("")
         self._stage = gui.add_html("")
@@ -45,9 +42,7 @@ class Rate(Pressing):
         with self._answering:
             # Never redrawn: who presses a button with the keyboard keeps the focus on it.
             gui.add_html(str(render("rate.html:answers", labels=ANSWERS)))
-            marks = tuple((value, str(value)) for value in range(1, 6))
-            self._slider = gui.add_slider("Rating", 1, 5, 1, _MIDDLE, marks=marks)
-            gui.add_html(str(render("rate.html:submit")))
+            gui.add_html(str(render("rate.html:slider", labels=ANSWERS)))
         self._tools = gui.add_html("")
         self._ahead = gui.add_html("")
         gui.add_html(keys_dialog(RATE_KEYS))
@@ -136,8 +131,6 @@ class Rate(Pressing):
         # Apart, so that the clip on screen is not drawn anew for it.
         self._put(self._ahead, render("player.html:ahead", source=self._address(rating.upcoming)))
         self._show_answers(shown)
-        if clip != self._clip:
-            self._clip, self._slider.value = clip, _MIDDLE
 
     def _draw_lesson(self) -> None:
         lesson, demo = self._lesson, self._context.demo

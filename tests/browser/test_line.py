@@ -120,11 +120,13 @@ def test_a_page_comes_back_after_a_restart_and_keeps_the_press_and_the_tab(chrom
         clip = shown_clip(page)
         other.click(".od-tabs >> text=Guide")
         other.wait_for_selector('.od-header[data-tab="guide"]')
+        page.route("**/press", lambda route: route.abort())
+        page.keyboard.press("4")  # on its way when the server goes
+        page.wait_for_selector(".od-problem.od-late >> text=Not saved yet")
         stop(site)
         page.wait_for_selector(f"{PILL} >> text=Connection lost. Trying again; nothing is lost.")
-        page.keyboard.press("4")
-        page.wait_for_selector(".od-problem.od-late >> text=Not saved yet")
         page.keyboard.press("5")  # it was answered already
+        page.unroute("**/press")
         page.wait_for_timeout(1000 * away)
         assert page.locator(f"{PILL} button >> text=Reload").is_visible()
         start(site)
@@ -149,10 +151,10 @@ def test_a_proxy_that_says_503_neither_drops_a_press_nor_is_shown_in_place_of_th
         clip = shown_clip(page)
         page.evaluate("() => { window.same = true }")
         page.route("**/*", refuse)
-        relay.break_off()
-        page.wait_for_selector(f"{PILL} >> text=Connection lost. Trying again; nothing is lost.")
         page.keyboard.press("4")
         page.wait_for_selector(".od-problem.od-late >> text=Not saved yet")
+        relay.break_off()
+        page.wait_for_selector(f"{PILL} >> text=Connection lost. Trying again; nothing is lost.")
         # Asked often enough to have loaded the page anew, had that been an answer.
         until(lambda: page.wait_for_timeout(50) or sum(url.endswith("/session") for url in asked) > 8)
         assert any(url.endswith("/press") for url in asked)
@@ -163,6 +165,27 @@ def test_a_proxy_that_says_503_neither_drops_a_press_nor_is_shown_in_place_of_th
         page.wait_for_selector(f'.od-clip [data-clip]:not([data-clip="{clip}"])', timeout=30_000)
         assert page.locator(f".od-problem, {PILL}").count() == 0
         assert site.events() == [("rate", clip, 4, "bo")]
+
+
+def test_without_a_connection_answers_are_seen_to_be_off_and_none_is_taken_in_silence(chromium, site, relay):
+    with opened(chromium, relay.url(site.links["annotator"]), scripts=[QUICK]) as page:
+        clip = shown_clip(page)
+        relay.break_off()
+        page.wait_for_selector(f"{PILL} >> text=Connection lost. Trying again; nothing is lost.")
+        button = page.locator('.od-answers [data-key="4"]')
+        until(
+            lambda: page.wait_for_timeout(50) or button.evaluate("e => getComputedStyle(e).opacity") == "0.45"
+        )
+        for key in ("4", "s"):
+            page.keyboard.press(key)
+            page.wait_for_selector(".od-problem >> text=Not taken: there is no connection.")
+        page.keyboard.press("ArrowRight")  # what concerns this browser alone goes on
+        page.wait_for_selector(".od-clip [data-still]")
+        relay.cut = False
+        page.wait_for_selector(PILL, state="detached", timeout=60_000)
+        assert shown_clip(page) == clip and site.events() == []
+        assert button.evaluate("e => getComputedStyle(e).opacity") == "1"
+        assert press_and_wait(page, site, lambda: page.keyboard.press("4")) == ("rate", clip, 4, "bo")
 
 
 def test_a_change_of_a_run_that_takes_long_is_not_cut_off(chromium, site, monkeypatch):
@@ -193,9 +216,12 @@ def test_a_change_of_a_run_that_takes_long_is_not_cut_off(chromium, site, monkey
 def test_a_page_comes_back_after_its_line_was_cut_for_40_s(chromium, site, relay):
     with opened(chromium, relay.url(site.links["annotator"])) as page:
         clip = shown_clip(page)
-        relay.break_off()
-        page.wait_for_timeout(40_000)
+        page.route("**/press", lambda route: route.abort())
         page.keyboard.press("4")
+        page.wait_for_timeout(100)
+        relay.break_off()
+        page.unroute("**/press")
+        page.wait_for_timeout(40_000)
         relay.cut = False
         until(lambda: page.wait_for_timeout(50) or site.events(), 60)
         assert shown_clip(page) != clip and site.events() == [("rate", clip, 4, "bo")]

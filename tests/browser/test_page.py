@@ -117,7 +117,7 @@ def press_and_wait(page, site, act: Callable[[], Any]) -> tuple:
 
 
 def drag_slider(page, value: int) -> None:
-    box = page.locator(".mantine-Slider-track").bounding_box()
+    box = page.locator(".od-slide input").bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
     page.mouse.move(box["x"] + box["width"] * (value - 1) / 4, box["y"] + box["height"] / 2, steps=5)
@@ -133,10 +133,16 @@ def test_annotator_rates_by_key_button_and_slider_and_researcher_downloads_it(ch
             (2, lambda: page.click('.od-answers [data-key="2"]')),
             (5, lambda: (drag_slider(page, 5), page.click("[data-submit]"))),
             (1, lambda: page.keyboard.press("1")),
-            (3, lambda: page.click("[data-submit]")),  # The slider is back in the middle.
+            (
+                3,
+                lambda: (page.click(".od-slide input"), page.click("[data-submit]")),
+            ),  # pressed in the middle
         ]
         for value, act in ways:
             clip = shown_clip(page)
+            # Of another clip the slider says nothing, and does not stand on 3.
+            page.wait_for_selector('.od-slide:not([data-moved]) [aria-valuetext="not set"]')
+            assert page.locator("[data-submit]").is_disabled()
             expected.append((clip, value))
             assert press_and_wait(page, site, act) == ("rate", clip, value, "bo")
         assert len(set(expected)) == 5
@@ -351,7 +357,7 @@ def test_researcher_sees_the_robot_move(chromium, site):
 def test_everything_needed_to_rate_is_on_one_screen(chromium, site, viewport):
     with opened(chromium, site.links["annotator"], viewport) as page:
         shown_clip(page)
-        for selector in (".od-rate-top", ".od-clip", ".od-answers", ".mantine-Slider-thumb", ".od-tools"):
+        for selector in (".od-rate-top", ".od-clip", ".od-answers", ".od-sliding", ".od-tools"):
             box = page.locator(selector).bounding_box()
             assert box["x"] >= 0 and box["x"] + box["width"] <= viewport["width"], selector
             assert box["y"] >= 0 and box["y"] + box["height"] <= viewport["height"], selector

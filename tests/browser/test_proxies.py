@@ -131,6 +131,7 @@ def test_the_page_works_behind_a_proxy(chromium, site, tmp_path, capsys, behind,
         cookies = {cookie["path"]: cookie for cookie in context.cookies() if cookie["httpOnly"]}
         assert set(cookies) == {f"{base_path}/r/2", f"{base_path}/"}
         assert all(cookie["secure"] == (kind == "nginx") for cookie in cookies.values())
+        page.click(".od-account")
         page.click("text=Sign out")
         page.wait_for_selector("text=You are signed out")
         assert page.url == f"{url}{base_path}/signed-out"

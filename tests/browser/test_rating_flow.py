@@ -262,7 +262,8 @@ def test_a_held_enter_on_a_button_gives_one_rating(chromium, site):
 def test_digits_are_keys_by_their_place(chromium, site):
     keys = [  # of French, Czech and programmers' Dvorak keyboards, French with Shift, and the keypad
         (4, "Digit4", "'", 52, 0), (2, "Digit2", "ě", 50, 0), (1, "Digit1", "%", 49, 0),
-        (3, "Digit3", "3", 51, 8), (5, "Numpad5", "5", 101, 0),
+        (3, "Digit3", "3", 51, 8), (5, "Numpad5", "5", 101, 0), (1, "Digit1", "&", 49, 0),
+        (1, "Digit1", "1", 49, 8),
     ]  # fmt: skip
     with opened(chromium, site.links["annotator"]) as page:
         for _, *key in keys:
@@ -273,6 +274,36 @@ def test_digits_are_keys_by_their_place(chromium, site):
         type_key(page, "Digit2", "~", 50, modifiers=1 | 2)  # AltGr of Windows: another sign
         page.wait_for_timeout(GUARD_MS)
         assert len(site.events()) == len(keys)
+
+
+def test_a_button_flashes_once_the_server_has_taken_the_press(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        shown_clip(page)
+        held = []
+        page.route("**/press", lambda route: held.append(route))
+        page.keyboard.press("4")
+        page.wait_for_selector('.od-answers .od-sent[data-key="4"]')
+        page.wait_for_timeout(400)
+        assert page.locator(".od-pressed").count() == 0
+        page.evaluate(
+            "() => new MutationObserver(() => {"
+            " window.flashed ||= document.querySelector('.od-pressed')?.dataset.key"
+            "}).observe(document.querySelector('.od-answers'), { attributes: true, subtree: true })"
+        )
+        held[0].continue_()
+        page.wait_for_function("() => window.flashed")
+        assert page.evaluate("() => window.flashed") == "4" and len(site.events()) == 1
+
+
+@pytest.mark.parametrize("modifier", ["Control", "Meta"])
+def test_the_usual_keys_for_undo_undo(chromium, site, modifier):
+    with opened(chromium, site.links["annotator"]) as page:
+        clip = shown_clip(page)
+        press_and_wait(page, site, lambda: page.keyboard.press("4"))
+        shown_clip(page)
+        page.keyboard.press(f"{modifier}+Shift+z")  # to do again what was undone, elsewhere
+        press_and_wait(page, site, lambda: page.keyboard.press(f"{modifier}+z"))
+        assert site.events() == [("rate", clip, 4, "bo"), ("undo", clip, None, "bo")]
 
 
 def test_letters_of_other_scripts_are_keys_by_their_place_and_latin_ones_by_their_label(chromium, site):
@@ -338,7 +369,8 @@ def test_a_mark_by_keys_and_taking_it_away(chromium, site):
         page.keyboard.press("m")
         page.keyboard.press("m")
         page.click("[data-unmark]")
-        page.wait_for_selector(".od-bar-note >> text=Drag to mark where it goes wrong")
+        page.wait_for_selector("[data-unmark]", state="hidden")
+        assert page.locator(".od-wrong").bounding_box()["width"] == 0
         press_and_wait(page, site, lambda: page.keyboard.press("3"))
         assert marks_of(site)[1][2:] == (None, None)
 
@@ -420,6 +452,8 @@ def test_everything_can_be_done_with_the_keyboard_and_the_focus_is_seen(chromium
             if name:
                 reached.add(name.split(" ")[0])
                 assert outline != "none", name
+            if name == "Rating":
+                page.keyboard.press("ArrowRight")  # until then there is nothing to submit
             if name.startswith("4") and not site.events():
                 press_and_wait(page, site, lambda: page.keyboard.press("Enter"))
                 assert site.events() == [("rate", clip, 4, "bo")]

@@ -150,13 +150,13 @@ class Comparisons:
             assert cursor.lastrowid is not None
             return cursor.lastrowid
 
-    def last_compared(self, run: str, rater_id: int) -> int | None:
-        """The pair that a rater answered or skipped last in a run, of those that hold, or None.
+    def last_compared(self, run: str, rater_id: int) -> tuple[int, str] | None:
+        """The pair that a rater answered or skipped last in a run, of those that hold, with the answer.
 
         Only among the rater's last 400 answers.
         """
         rows = self._database.rows(
-            "SELECT c.pair_id FROM comparisons c JOIN pairs p ON p.id = c.pair_id"
+            "SELECT c.pair_id, c.answer FROM comparisons c JOIN pairs p ON p.id = c.pair_id"
             " WHERE c.rater_id = ?1 AND p.run = ?2 AND c.answer != 'undo'"
             " AND c.id > COALESCE((SELECT id FROM comparisons WHERE rater_id = ?1 ORDER BY id DESC LIMIT 1"
             f"  OFFSET {LOOKED_BACK}), 0) AND NOT EXISTS ("
@@ -164,7 +164,7 @@ class Comparisons:
             "  AND l.id > c.id) ORDER BY c.id DESC LIMIT 1",
             (rater_id, run),
         )
-        return rows[0][0] if rows else None
+        return rows[0] if rows else None
 
     def count(self, run: str) -> int:
         """How many answers hold in a run."""
