@@ -99,7 +99,7 @@
 
   const count = (number, one) => `${Number(number).toLocaleString("en")} ${one}${Number(number) === 1 ? "" : "s"}`;
 
-  function editRun({ editRun: run, title, note, ratings, comparisons, here }) {
+  function editRun({ editRun: run, title, note, rated: ratings, comparisons, here }) {
     const dialog = dialogOf("od-edit-run", run);
     const form = dialog.querySelector("form");
     [form.elements.title.value, form.elements.note.value] = [title, note];
@@ -195,7 +195,7 @@
   function wrong(input, text) {
     const field = input.closest(".od-field");
     if (!field) return;
-    let note = field.querySelector(".od-wrong");
+    let note = field.querySelector(".od-field-wrong");
     if (!text) {
       note?.remove();
       input.removeAttribute("aria-invalid");
@@ -203,7 +203,7 @@
     }
     if (!note) {
       note = document.createElement("small");
-      note.className = "od-wrong";
+      note.className = "od-field-wrong";
       note.setAttribute("role", "alert");
       input.after(note);
     }

@@ -10,6 +10,7 @@ from onedemo.app.dataset.card import card
 from onedemo.app.dataset.csv_writer import csv_blocks
 from onedemo.app.dataset.parquet import write_pairs, write_segments
 from onedemo.core.files import replacing, write_atomic
+from onedemo.demos.library import list_demos
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.rating_records import HISTORY_COLUMNS, RATING_COLUMNS, SKIP_COLUMNS
 from onedemo.storage.store import Store
@@ -35,7 +36,12 @@ def write_export(store: Store, run: str | None, directory: Path) -> None:
 def write_file(store: Store, run: str | None, name: str, file: Path) -> None:
     """Writes one of ``FILES`` under another name; a file that is there is replaced once it is whole."""
     if name == "segments.parquet":
-        runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
+        frames = {demo.sha256: demo.frames for demo in list_demos(store.path.parent / "demos")}
+        runs = [
+            entry | {"demo_frames": frames.get(entry["demo_sha256"])}
+            for entry in store.runs.all()
+            if run in (None, entry["id"])
+        ]
         roles = {rater.name: rater.role for rater in store.accounts.raters()}
         with replacing(file) as half:
             write_segments(half, store.clips.answered(run), runs, roles)

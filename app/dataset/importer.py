@@ -19,6 +19,7 @@ from onedemo.app.dataset.exporter import FILES
 from onedemo.app.dataset.parquet import read_about, read_pairs, read_segments
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_description, check_name
+from onedemo.demos.library import list_demos
 from onedemo.errors import UserError
 from onedemo.sim.vector_env import spec
 from onedemo.storage.comparisons import ANSWERS
@@ -96,6 +97,7 @@ def import_data(export: Export, data_dir: Path) -> dict[str, int]:
     if len({run["id"] for run in runs}) != len(runs):
         raise UserError(f"{export.segments} describes a run twice")
     widths = {run["id"]: _widths(run, export.segments) for run in runs}
+    _check_demos(runs, data_dir)
     store = Store(data_dir)
     try:
         if store.runs.all():
@@ -240,6 +242,9 @@ def _check_run(run: Any, file: Path) -> None:
         check_name(run["demo"])
         if not re.fullmatch(r"[0-9a-f]{64}", run["demo_sha256"], re.ASCII):
             raise ValueError("demo_sha256 is not a SHA-256")
+        frames = run.get("demo_frames")
+        if frames is not None and (type(frames) is not int or not 0 < frames < 1_000_000):
+            raise ValueError("demo_frames is out of range")
         if not 0 <= run["seed"] < 2**63 or isinstance(run["seed"], bool):
             raise ValueError("seed is out of range")
         if not re.fullmatch(r"[\w.+!-]{1,40}", run["version"], re.ASCII):
@@ -254,6 +259,19 @@ def _check_run(run: Any, file: Path) -> None:
         tomllib.loads(run["config"])
     except (UserError, ValueError, TypeError, RecursionError) as error:
         raise UserError(f"{file} does not say what its runs are: {error}") from None
+
+
+def _check_demos(runs: list[dict[str, Any]], data_dir: Path) -> None:
+    """Raises UserError if a demo of the same name is there already, and is not the one that was rated."""
+    there = {demo.name: demo for demo in list_demos(data_dir / "demos")}
+    for run in runs:
+        demo, given = there.get(run["demo"]), run.get("demo_frames")
+        if demo is not None and given is not None and demo.sha256 != run["demo_sha256"]:
+            raise UserError(
+                f"run {run['id']} was rated beside a demo {demo.name} of {given} frames, and the one in "
+                f"{data_dir} has {demo.frames} and other pictures: give that another name (onedemo demo "
+                "rename), and put the right one there"
+            )
 
 
 def _widths(run: dict[str, Any], file: Path) -> dict[str, int]:

@@ -219,7 +219,7 @@ class Uploads:
     async def _upload(self, request: web.Request) -> AsyncIterator[_Upload]:
         """What an address names, for one request at a time."""
         name = request.match_info["upload"]
-        gone = web.HTTPGone(text="This video is not here any more. Please choose it again.")
+        gone = web.HTTPNotFound(text="This video is not here any more. Please choose it again.")
         if (upload := self._waiting.get(name)) is None:
             raise gone
         self._wait_on(name)

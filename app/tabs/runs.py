@@ -181,7 +181,7 @@ def runs_html(
     runs: Sequence[Mapping[str, Any]], figures: Mapping[str, Mapping[str, Any]], current: str,
     status: Status, drawn: Sequence[str],
 ) -> Markup:  # fmt: skip
-    """The table of runs, the newest first.
+    """The table of runs: the one that is served, then the newest first.
 
     Args:
         runs: As ``Store.runs.all``.
@@ -193,7 +193,7 @@ def runs_html(
     rows = [
         _line(run, figures[run["id"]], status if run["id"] == current else None)
         | {"compared": run["id"] in drawn}
-        for run in reversed(runs)
+        for run in sorted(reversed(runs), key=lambda run: run["id"] != current)
     ]
     return render("runs.html:table", rows=rows)
 

@@ -164,17 +164,30 @@ def test_runs_side_by_side(chromium, site):
     with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Runs")
         page.wait_for_selector(".od-runs >> text=hop-1")
-        row = page.locator(".od-runs tr", has_text="hop-1")
-        assert row.locator("td").all_inner_texts()[:6] == ["hopper-hop", "paper", "4", "0", "5", "80 k"]
-        assert page.locator(".od-current th").inner_text() == site.trainer.run
+        cells = page.locator('tr[data-run="hop-1"]').locator("th, td").all_inner_texts()
+        assert cells[0].split("\n") == ["hop-1", "hopper-hop, paper, seed 4"]
+        assert [cell.replace("\xa0", " ") for cell in cells[1:6]] == [
+            "Stopped", "0", "80 k of 10.00 M", "2.5 of 5", "500 points",
+        ]  # fmt: skip
+        page.set_viewport_size(DESKTOP)
+        numbers = page.locator(".od-runs tbody tr").first.locator(".od-number")
+        assert numbers.evaluate_all("all => all.map(n => getComputedStyle(n).textAlign)") == ["right"] * 4
+        assert page.locator(".od-current .od-run-name").inner_text() == site.trainer.run
         until(lambda: page.locator(".uplot").count() == 2)
         assert page.locator('[data-compare][aria-pressed="true"]').count() == 2
         for label in ("Pause", "Resume"):
             page.click(f'.od-current >> text="{label}"')
         until(lambda: [call for call in site.trainer.calls if call != "pairs"] == ["pause", "resume"])
         page.fill('.od-new-run [name="name"]', "another")
-        page.click(".od-new-run button")
-        page.wait_for_selector(".od-form-note >> text=there is this run alone")
+        page.click(".od-new-run >> text=Start the run")
+        page.wait_for_selector(".od-form-note >> text=There is this run alone")
+        for viewport in ({"width": 390, "height": 844}, {"width": 820, "height": 1180}, DESKTOP):
+            page.set_viewport_size(viewport)
+            for button in page.locator(
+                'tr[data-run="hop-1"] button'
+            ).all():  # none is behind a sideways scroll
+                box = button.bounding_box()
+                assert box["x"] >= 0 and box["x"] + box["width"] <= viewport["width"], viewport
 
 
 def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
@@ -187,7 +200,7 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
         store.runs.add_iteration(name, 1, snapshot=1, env_steps=16000, stats={"predicted": 2.0, "kl": 0.01})
     with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Runs")
-        page.wait_for_selector(".od-which >> text=6 runs drawn.")
+        page.wait_for_selector(".od-which >> text=6 runs drawn")
 
         def legend():
             said = page.locator(".od-legend-of-chart").first.locator("span").all_inner_texts()
@@ -199,14 +212,22 @@ def test_any_of_fifty_runs_is_compared_and_branched_from(chromium, site):
         until(lambda: legend() == [*newest, "hop-0", site.trainer.run])
         page.locator('[data-compare="hop-47"]').click()
         until(lambda: "hop-47" not in legend())
-        page.fill("div:has(> .od-runs) + div input", "hop-1, BACK")  # a whole name is not a part of others
-        until(lambda: legend() == ["hop-1", site.trainer.run])
-        page.fill("div:has(> .od-runs) + div input", "hop")
-        page.wait_for_selector(".od-which >> text=The newest 12 of 50 such runs are drawn.")
+        page.click(".od-which >> text=Clear")
+        page.wait_for_selector(".od-which >> text=No run is drawn")
+        assert page.locator('[data-compare][aria-pressed="true"]').count() == 0
+        chosen = [f"hop-{k}" for k in range(12, -1, -1)]
+        for name in chosen:
+            page.locator(f'[data-compare="{name}"]').click()
+            on = f'[data-compare="{name}"][aria-pressed="true"]'
+            page.wait_for_selector(f"{on}, .od-which:has-text('12 of the 13')")
+        page.wait_for_selector(".od-which >> text=12 of the 13 chosen runs are drawn")
+        until(lambda: legend() == chosen[:12])
+        page.click(".od-which >> text=The newest ones")
+        until(lambda: legend() == [*newest, site.trainer.run])
         assert site.events() == []
         page.select_option('.od-new-run [name="predictor_from"]', "hop-0")
         table = page.locator(".od-runs .od-scroll").bounding_box()
-        assert table["height"] < 600
+        assert table["height"] < 730
 
 
 def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site):

@@ -85,13 +85,14 @@ def test_nothing_without_a_session(site, path):
 EXAMPLE = choose(None, DEMO_FRAMES, 9).guide[0].name
 EXAMPLES = {
     "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": EXAMPLE, "iteration": "1", "suffix": "jpg",
+    "tab": "rate", "upload": "a" * 32, "demo": "b" * 64, "result": "1",
 }  # fmt: skip
 """What the places in a route's path may be; the rater is the annotator."""
 STRANGERS_MAY = {
     "/login", "/signed-out", "/healthz", "/static/login.css", "/static/icon.svg", "/r/2/login",
     "/r/2/session",
 }  # fmt: skip
-ANNOTATORS_MAY = {"/", "/r/2", "/r/2/", "/r/2/press", "/r/2/signout"} | {
+ANNOTATORS_MAY = {"/", "/r/2", "/r/2/", "/r/2/press", "/r/2/signout", "/r/2/rate"} | {
     place + path
     for path in (
         "/static/page.css", "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
@@ -121,7 +122,7 @@ def test_every_route_asks_for_its_role(site, role):
     for route in site.front.routes():
         path = route.path.replace("/static/{name}", "/static/page.css")
         for name, example in EXAMPLES.items():
-            path = re.sub(rf"\{{{name}(:[^/]*?)?\}}(?=[./]|$)", example, path)
+            path = re.sub(rf"\{{{name}(:[^/]*?(\{{\d+(,\d+)?\}})?)?\}}(?=[./]|$)", example, path)
         if role == "researcher":
             path = path.replace("/r/2", "/r/1")
         plain = path.replace("/r/1", "/r/2")
@@ -135,7 +136,7 @@ def test_every_route_asks_for_its_role(site, role):
             # No form, no token in it, or no open page named; or nobody of whom to say whether they are in.
             refused = (403, 415) if route.method == "POST" else (401,) if plain == "/r/2/session" else ()
             assert status in (200, 204, 303, 400, 404, *refused), f"{path} for a {role}: {status}"
-            assert status != 404 or path.endswith(("/pairs/1.jpg", "/rollouts/1.jpg"))
+            assert status != 404 or path.endswith(("/pairs/1.jpg", "/rollouts/1.jpg")) or "/demos/" in path
         else:
             assert status == (401 if role == "stranger" else 403), f"{path} for a {role}"
 

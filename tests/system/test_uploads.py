@@ -2,21 +2,25 @@
 
 import asyncio
 import re
+import zipfile
 
 import aiohttp
+import cv2
+import numpy as np
 import pytest
 from aiohttp import web
 
 from helpers.beside_playwright import run
+from onedemo.app.admin.backup import back_up
 from onedemo.app.http import uploads
 from onedemo.app.http.auth import PAGE_HEADER, AccessControl, Route
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.http.uploads import Uploads
 from onedemo.app.network.bind import Listening
 from onedemo.core.directories import Workshop
-from onedemo.demos.library import find_demo, read_frames
+from onedemo.demos.library import find_demo, list_demos, read_frames
 from onedemo.storage.store import Store
-from unit.demos.test_library import make_video
+from unit.demos.test_library import make_video, number_of
 
 pytestmark = pytest.mark.seam
 
@@ -34,7 +38,7 @@ def store(tmp_path):
 
 
 def visit(store, what, *, role="researcher", **limits):
-    """Opens a access with this one address, logs somebody in, and does ``what(session, url)``."""
+    """Opens a access with the addresses of uploads, logs somebody in, and does ``what(session, url)``."""
 
     async def go():
         port = 0
@@ -42,7 +46,13 @@ def visit(store, what, *, role="researcher", **limits):
         taken = Uploads(store.path.parent, **limits)
         routes = [
             Route("GET", "/login", "stranger", access.log_in),
+            Route("GET", r"/demos/{demo:[0-9a-f]{64}}.jpg", "researcher", taken.picture),
             Route("POST", "/demos", "researcher", taken.add),
+            Route("GET", "/demos/{upload}/poster.jpg", "researcher", taken.poster),
+            Route("POST", "/demos/{upload}/result", "researcher", taken.bring_in),
+            Route("GET", "/demos/{upload}/result-{result}.webm", "researcher", taken.result),
+            Route("POST", "/demos/{upload}/keep", "researcher", taken.keep),
+            Route("POST", "/demos/{upload}/discard", "researcher", taken.discard),
         ]
         runner = web.AppRunner(access.application(routes), shutdown_timeout=1)
         await runner.setup()
@@ -57,27 +67,55 @@ def visit(store, what, *, role="researcher", **limits):
                     await session.get(link, allow_redirects=False)
                 return await what(session, url)
         finally:
+            taken.close()
             await runner.cleanup()
 
     return run(go())
 
 
-told = []
-"""The names of demos that were told beside the answers."""
+class Refused(Exception):
+    """An answer that is not 200."""
 
 
-def send(store, content, *, origin=None, filename="../../evil.mp4", role="researcher", limits=None, **fields):
-    async def post(session, url):
+class Sender:
+    """What static/demos.js does."""
+
+    def __init__(self, session, url, origin=None):
+        self.session, self.url = session, url
+        self.headers = {"Origin": origin or url, PAGE_HEADER: "a"}
+
+    async def post(self, path, **what):
+        async with self.session.post(self.url + path, headers=self.headers, **what) as answer:
+            if answer.status not in (200, 204):
+                raise Refused(answer.status, await answer.text())
+            return await answer.json() if answer.status == 200 else None
+
+    async def get(self, path):
+        async with self.session.get(self.url + path) as answer:
+            return answer.status, await answer.read()
+
+    async def add(self, content, field="video", filename="../../evil.mp4"):
         form = aiohttp.FormData()
-        for name, value in ({"name": "kick"} | fields).items():
-            form.add_field(name, value)
-        form.add_field("video", content, filename=filename, content_type="video/mp4")
-        headers = {"Origin": origin or url, PAGE_HEADER: "a"}
-        async with session.post(url + "/demos", data=form, headers=headers) as answer:
-            told.append(answer.headers.get("X-Demo"))
-            return answer.status, await answer.text()
+        form.add_field(field, content, filename=filename, content_type="video/mp4")
+        return await self.post("/demos", data=form)
 
-    return visit(store, post, role=role, **(limits or {}))
+    async def keep(self, upload, name="kick"):
+        return await self.post(f"/demos/{upload}/keep", params={"name": name})
+
+
+def send(store, content, *, origin=None, role="researcher", limits=None, name="kick", field="video", **part):
+    """All steps: the last answer, or the status and sentence of the one that was refused."""
+
+    async def go(session, url):
+        sender = Sender(session, url, origin)
+        try:
+            there = await sender.add(content, field)
+            facts = await sender.post(f"/demos/{there['upload']}/result", json=part)
+            return 200, facts | await sender.keep(there["upload"], name)
+        except Refused as refused:
+            return refused.args
+
+    return visit(store, go, role=role, **(limits or {}))
 
 
 def left(store):
@@ -86,8 +124,9 @@ def left(store):
 
 
 def test_a_video_becomes_a_demo(store, video):
-    status, said = send(store, video, start="0.2", end="0.8", crop="8, 40, 48, 40", mirror="on")
-    assert (status, said) == (200, "kick is a demo now: 0.6 s, 18 frames.")
+    status, said = send(store, video, start=0.2, end=0.8, crop=[8, 40, 48, 40], mirror=True)
+    assert status == 200 and (said["name"], said["known"]) == ("kick", False)
+    assert (said["frames"], said["fps"], said["width"], said["height"]) == (18, 30.0, 48, 40)
     demo = find_demo("kick", store.path.parent / "demos")
     assert (demo.frames, demo.source) == (18, "uploaded")
     assert read_frames(demo).shape[1:] == (40, 48, 3)
@@ -96,10 +135,93 @@ def test_a_video_becomes_a_demo(store, video):
 
 def test_a_video_that_is_known_keeps_its_name(store, video):
     """The page offers the name that is told, not the one that was typed."""
-    assert send(store, video)[1] == "kick is a demo now: 1.0 s, 30 frames."
-    status, said = send(store, video, name="punch", end="9")
-    assert (status, said) == (200, "This video is known already, as kick: 1.0 s, 30 frames.")
-    assert told[-2:] == ["kick", "kick"]
+    assert send(store, video)[1]["name"] == "kick"
+    status, said = send(store, video, name="punch", end=9)
+    assert (status, said["name"], said["known"]) == (200, "kick", True)
+
+
+def test_a_part_is_looked_at_and_chosen_anew_without_sending_the_video_again(store, video):
+    """What is looked at is what is kept, and is in no library before."""
+    here = store.path.parent
+
+    async def what(session, url):
+        sender = Sender(session, url)
+        there = await sender.add(video)
+        assert (there["width"], there["height"], there["fps"]) == (160, 96, 30.0)
+        assert there["seconds"] == pytest.approx(1, abs=0.05)
+        at = f"/demos/{there['upload']}"
+        pictures = [await sender.get(f"{at}/poster.jpg?at={second}") for second in ("0", "0.5", "99")]
+        decoded = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for _, data in pictures]
+        assert [number_of(image) for image in decoded] == [0, 15, 29]
+        with pytest.raises(Refused, match="look at the result first"):
+            await sender.keep(there["upload"])
+        await sender.post(f"{at}/result", json={})
+        facts = await sender.post(f"{at}/result", json={"start": 0.5, "end": None, "crop": None})
+        assert (facts["frames"], facts["known"]) == (15, None)
+        assert facts["warnings"] == ["The picture is only 160 x 96 pixels; details will be hard to see."]
+        assert (await sender.get(f"{at}/result-1.webm"))[0] == 404  # of before
+        status, film = await sender.get(f"{at}/result-{facts['result']}.webm")
+        assert status == 200 and film[:4] == b"\x1aE\xdf\xa3"
+        assert list_own(here) == []
+        with pytest.raises(Refused, match="A name is 1 to 64"):
+            await sender.keep(there["upload"], "no/slash")
+        kept = await sender.keep(there["upload"], "half")
+        demo = find_demo("half", here / "demos")
+        assert demo.path.read_bytes() == film and kept == {"name": "half", "known": False}
+        picture = await sender.get(f"/demos/{demo.sha256}.jpg")
+        assert picture[0] == 200 and picture[1][:2] == b"\xff\xd8"
+        assert (await sender.get(f"/demos/{'0' * 64}.jpg"))[0] == 404
+        with pytest.raises(Refused, match="not here any more"):
+            await sender.keep(there["upload"], "again")
+
+    visit(store, what)
+    assert list_own(here) == ["half"] and list((here / "uploads").iterdir()) == []
+
+
+def list_own(here):
+    return [demo.name for demo in list_demos(here / "demos") if demo.path.is_relative_to(here)]
+
+
+def test_what_is_neither_kept_nor_discarded_goes(store, video):
+    uploads_dir = store.path.parent / "uploads"
+
+    async def what(session, url):
+        sender = Sender(session, url)
+        first = (await sender.add(video))["upload"]
+        assert len(list(uploads_dir.iterdir())) == 1
+        await sender.post(f"/demos/{first}/discard")
+        assert list(uploads_dir.iterdir()) == []
+        names = [(await sender.add(video))["upload"] for _ in range(uploads.MOST_WAITING + 1)]
+        assert len(list(uploads_dir.iterdir())) == uploads.MOST_WAITING
+        assert [(await sender.get(f"/demos/{name}/poster.jpg"))[0] for name in names[:2]] == [404, 200]
+
+    visit(store, what)
+    assert list(uploads_dir.iterdir()) == []
+
+    async def forgotten(session, url):
+        await Sender(session, url).add(video)
+        for _ in range(200):
+            if not list(uploads_dir.iterdir()):
+                return
+            await asyncio.sleep(0.05)
+        raise AssertionError("it is still there")
+
+    visit(store, forgotten, wait=0.3)
+
+
+def test_no_backup_saves_what_waits(store, video, tmp_path_factory):
+    file = tmp_path_factory.mktemp("backup") / "all.zip"
+
+    async def what(session, url):
+        sender = Sender(session, url)
+        there = await sender.add(video)
+        await sender.post(f"/demos/{there['upload']}/result", json={})
+        assert len([path for path in (store.path.parent / "uploads").rglob("*") if path.is_file()]) == 3
+        return await asyncio.to_thread(back_up, store.path.parent, file)
+
+    saved = visit(store, what)
+    assert saved.left_out == []
+    assert not [name for name in zipfile.ZipFile(file).namelist() if "upload" in name or "demos" in name]
 
 
 def test_a_video_may_be_larger_than_other_requests(store, video):
@@ -126,12 +248,15 @@ def test_only_from_the_page(store, video):
         (b"<!doctype html><html>", {}, "^The video is a web page: download the video itself"),
         (None, {"name": "../up"}, "name"),
         (None, {"name": "a\u202eb"}, "name"),
-        (None, {"name": "x" * 5000}, "Name is up to 200"),
-        (None, {"start": "9"}, "Start 9 is past the end of the video"),
+        (None, {"name": "x" * 5000}, "A name is 1 to 64"),
+        (None, {"start": 9}, "Start 9 is past the end of the video"),
         (None, {"start": "nan"}, "Start is a number"),
-        (None, {"crop": "1,2,3"}, "The part of the video must be four whole numbers"),
-        (None, {"crop": "0,0,9999,9999"}, "[Cc]rop"),
-        (None, {"owner": "me"}, "has the fields"),
+        (None, {"end": True}, "End is a number"),
+        (None, {"crop": [1, 2, 3]}, "The part of the picture is four whole numbers"),
+        (None, {"crop": [0, 0, 9999, 9999]}, "[Cc]rop"),
+        (None, {"crop": [-5, 0, 64, 64]}, "[Cc]rop"),
+        (None, {"owner": "me"}, "has start, end, crop and mirror"),
+        (None, {"field": "name"}, "one field, video"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence(store, video, content, fields, words):
@@ -157,8 +282,6 @@ def slow(video, wait):
 
 async def begin(session, url, wait, video):
     with aiohttp.MultipartWriter("form-data") as form:
-        part = form.append("kick")
-        part.set_content_disposition("form-data", name="name")
         part = form.append(slow(video, wait)())
         part.set_content_disposition("form-data", name="video", filename="a.mp4")
     return await session.post(url + "/demos", data=form, headers={"Origin": url, PAGE_HEADER: "a"})

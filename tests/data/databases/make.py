@@ -71,6 +71,8 @@ def make(version: int, file: Path) -> None:
         put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
             " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
         put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
+        if version >= 9:
+            put("UPDATE runs SET title = 'With marks', note = 'Bo left at half.'")
         put("INSERT INTO audit (at, who, what, detail) VALUES (?, 'ada', 'came in', 'link 1')", (AT,))
         if version >= 8:
             put(

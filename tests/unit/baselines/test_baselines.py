@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from helpers.paths import DEMOS
-from onedemo.baselines import handcoded_trpo, trajectory_search
+from onedemo.baselines import handcoded_trpo, make_demo, trajectory_search
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
 from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
@@ -128,6 +128,16 @@ def test_cost_of_the_ground():
     assert clearances(poses)["foot"][0] < 0.011
     stance_cost, kneeling_cost = trajectory_search.cost(plan, poses[:, None], 0 * poses[:, None], np.zeros(1))
     assert stance_cost < 5 < 30 < kneeling_cost
+
+
+def test_a_demo_that_could_not_be_written_is_not_rendered(tmp_path):
+    """What a command will leave is tried before its work begins: there are not even states to render here."""
+    (tmp_path / "a.webm").mkdir()
+    for name, words in (("a", "a.webm is a directory"), ("b/c", "a name is 1 to 64")):
+        with pytest.raises(UserError, match=words):
+            make_demo.main([name, "--task", "hop", "--source", "x", "--out", str(tmp_path)])
+    with pytest.raises(UserError, match=r"cannot write .*gone"):
+        make_demo.main(["a", "--task", "hop", "--source", "x", "--out", str(tmp_path / "gone")])
 
 
 def test_hidden_states_refuse_what_they_are_not(tmp_path):

@@ -27,9 +27,11 @@ from onedemo.app.dataset.parquet import _opened
 from onedemo.app.http.exports import Downloads
 from onedemo.baselines.preferences import stored_comparisons
 from onedemo.config import load_config, to_toml
+from onedemo.demos.library import import_video
 from onedemo.storage.clips import NewClip
 from onedemo.storage.comparisons import NewPair
 from onedemo.storage.store import Store
+from unit.demos.test_library import make_video
 
 EVENTS = (
     "SELECT e.*, p.name, b.name FROM events e JOIN raters p ON p.id = e.rater_id"
@@ -381,3 +383,24 @@ def test_a_full_disk_is_a_sentence_and_leaves_no_half_file(study, tmp_path, opti
     said = capsys.readouterr().err
     assert "The disk is full: free some space" in said and said.count("\n") == 1, said
     assert set(left) <= {"history.csv"}  # whole ones of a whole export
+
+
+@pytest.mark.seam
+def test_a_demo_of_that_name_with_other_frames_is_named_before_anything_is_imported(tmp_path, capsys):
+    there, here = tmp_path / "there", tmp_path / "here"
+    rated = import_video(make_video(tmp_path / "a.avi", count=20), name="kick", demos_dir=there / "demos")
+    import_video(make_video(tmp_path / "b.avi", count=15), name="kick", demos_dir=here / "demos")
+    config = to_toml(load_config(None, {}))
+    with closing(Store(there)) as store:
+        store.runs.add(run="r-1", demo="kick", demo_sha256=rated.sha256, seed=0, config=config, version="1",
+                       title="With marks", note="Bo left at half.")  # fmt: skip
+    assert main(["export", "--data-dir", str(there), "--all", str(tmp_path / "all")]) == 0
+    assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 2
+    said = capsys.readouterr().err
+    assert "run r-1 was rated beside a demo kick of 20 frames" in said and "has 15 and other pictures" in said
+    assert not (here / "runs").exists()
+    assert main(["demo", "rename", "kick", "kick-other", "--data-dir", str(here)]) == 0
+    assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 0
+    with closing(Store(here)) as store:
+        (run,) = store.runs.all()
+    assert (run["title"], run["note"]) == ("With marks", "Bo left at half.")

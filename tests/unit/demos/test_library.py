@@ -67,12 +67,12 @@ def make_video(path, count=30, fps=30.0, size=(WIDTH, HEIGHT), picture=numbered)
 def quickly(request, monkeypatch):
     """Decodes in this process, but for tests that are marked ``seam``: the child has tests of its own."""
     if request.node.get_closest_marker("seam") is None:
-        monkeypatch.setattr(demos, "decode", lambda path, options, limits: in_process(path, options))
+        monkeypatch.setattr(demos, "decode", lambda path, options, _, warn: in_process(path, options, warn))
 
 
-def in_process(path, options):
+def in_process(path, options, warn):
     with path.open("rb") as file:
-        yield from shaped_frames(file, str(path), options)
+        yield from shaped_frames(file, str(path), options, warn)
 
 
 @pytest.fixture
@@ -517,3 +517,35 @@ def test_what_is_no_video_is_named_before_anything_is_decoded(tmp_path, library,
     assert re.search(words, refused(tmp_path / "x.mp4", library))
     with pytest.raises(UserError, match="is a folder: give one video file"):
         import_video(tmp_path, name="x", demos_dir=library)
+
+
+def test_a_video_that_an_older_version_decoded_otherwise_is_decoded_again(video, library, monkeypatch):
+    """It would be "known already", with its wrong frames."""
+    first = import_video(video, name="move", demos_dir=library)
+    about = json.loads((first.path.parent / "demo.json").read_bytes())
+    assert import_video(video, name="again", demos_dir=library) == first  # not even decoded
+    wrong = list(reversed(range(30)))
+    upset = library / ("f" * 64)
+    first.path.parent.rename(upset)
+    write_webm(upset / "video.webm", (numbered(i) for i in wrong), fps=30.0)
+    (upset / "demo.json").write_text(json.dumps(about | {"sha256": "f" * 64, "decoding": 1}))
+    again = import_video(video, name="again", demos_dir=library)
+    assert again.sha256 == first.sha256 and numbers(again) == list(range(30))
+    assert [number_of(frame) for frame in read_frames(find_demo("move", library))] == wrong
+    del about["decoding"]  # a version that noted none, but gave the same frames
+    (again.path.parent / "demo.json").write_text(json.dumps(about | {"name": "again"}))
+    assert import_video(video, name="third", demos_dir=library).name == "again"
+
+
+def test_what_can_be_used_and_is_not_as_it_should_be_is_said(tmp_path, library):
+    said = []
+    path = make_video(tmp_path / "slow.gif", count=12, fps=10, size=(64, 48))
+    import_video(path, name="slow", demos_dir=library, warn=said.append)
+    assert [sentence.split(";")[0] for sentence in said] == [
+        "it has 10 frames a second", "the picture is only 64 x 48 pixels",
+    ]  # fmt: skip
+    said.clear()
+    import_video(
+        make_video(tmp_path / "fine.mp4", size=(320, 240)), name="fine", demos_dir=library, warn=said.append
+    )
+    assert said == []

@@ -16,10 +16,10 @@ import pytest
 from onedemo.demos import sandboxed_decoder
 from onedemo.demos.decoder_child import shaped_frames
 from onedemo.demos.library import import_video
-from onedemo.demos.sandboxed_decoder import Limits, Options, decode
+from onedemo.demos.sandboxed_decoder import Limits, Options, decode, look
 from onedemo.demos.source import THREADS
 from onedemo.errors import UserError
-from unit.demos.test_library import make_video, refused
+from unit.demos.test_library import make_video, number_of, refused
 
 pytestmark = pytest.mark.seam
 
@@ -267,3 +267,24 @@ def test_the_child_takes_the_same_on_any_machine(tmp_path, monkeypatch):
     assert int(re.search(r"Threads:\s+(\d+)", status)[1]) <= 1 + THREADS
     assert int(re.search(r"VmPeak:\s+(\d+)", status)[1]) / 1024 < 1024
     assert env["MALLOC_ARENA_MAX"] == "2"
+
+
+def test_a_look_gives_one_frame_and_what_the_container_says(tmp_path):
+    path = make_video(tmp_path / "a.mp4", count=45, size=(1280, 96))
+    found = look(path, at=1.0)
+    assert (found.width, found.height, found.fps) == (1280, 96, 30.0)
+    assert found.seconds == pytest.approx(1.5, abs=0.05)
+    assert found.picture.shape == (48, 640, 3) and number_of(found.picture) == 30
+    assert number_of(look(path).picture) == 0 and number_of(look(path, at=60).picture) == 44
+    (tmp_path / "b.mp4").write_bytes(b"\0hello " * 999)
+    with pytest.raises(UserError, match="is not a video that can be read"):
+        look(tmp_path / "b.mp4")
+
+
+def test_warnings_come_through_the_pipe(tmp_path):
+    said = []
+    frames = list(decode(make_video(tmp_path / "a.gif", count=12, fps=10), Options(), warn=said.append))
+    assert len(frames) == 36 and said == [
+        "it has 10 frames a second; fast moves can be seen better with 24 or more",
+        "the picture is only 160 x 96 pixels; details will be hard to see",
+    ]

@@ -46,6 +46,9 @@ class Behind:
     def is_open(self, rater_id, token):
         return token == "open"
 
+    def tabs(self, role):
+        return ["watch", "runs", "rate", "data"] if role == "researcher" else ["rate", "guide"]
+
     def press(self, rater_id, press):
         assert not self.is_open(rater_id, press.page)
         raise PageGone("gone")
@@ -477,9 +480,9 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
         async with front(store) as door, browser(door) as one:
             await one.get(link_of(store, door.url, "ada", "researcher"))
             paths = [route.path for route in door.routes() if route.method == "POST"]
-            assert len(paths) == 6
+            assert len(paths) == 12
             for path in paths:
-                path = path.replace(r"{rater:\d{1,9}}", "1")
+                path = path.replace(r"{rater:\d{1,9}}", "1").replace("{upload:[0-9a-f]{32}}", "a" * 32)
                 refused = [
                     await one.post(path, page=""),
                     await one.post(path, page="another"),
@@ -495,6 +498,63 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
             assert door.behind.trainer.paused == 0
             assert (await one.post("/r/1/do")).status == 204
             assert door.behind.trainer.paused == 1
+
+    run(go())
+
+
+def test_a_tab_has_an_address(store):
+    """Reload, and a link to a colleague or to somebody with fewer tabs."""
+
+    async def go():
+        async with front(store) as door, browser(door) as ada, browser(door) as bob:
+            await ada.get(link_of(store, door.url, "ada", "researcher"))
+            await bob.get(link_of(store, door.url, "bob"))
+            page = await ada.get("/r/1/data")
+            assert page.status == 200 and "data-p=" in page.text
+            for query in ("?playbackPath=data:,x", "?"):
+                answer = await ada.get(f"/r/1/data{query}")
+                assert query == "?" or (answer.status, answer.headers["Location"]) == (303, "/r/1/data")
+            assert (await bob.get("/r/2/guide")).status == 200
+            answer = await bob.get("/r/2/data")
+            assert (answer.status, answer.headers["Location"]) == (303, "/r/2/")
+            # Sent by ada: bob is somebody else, and may go to the like of his own.
+            sent = await bob.get("/r/1/data")
+            assert sent.status == 401 and "You are signed in as bob" in sent.text
+            assert 'href="/r/2/data"' in sent.text
+            assert (await bob.get("/r/1/clips/1.jpg")).status == 401
+
+    run(go())
+
+
+def test_who_is_sent_a_tab_and_opens_a_link_comes_to_that_tab(store):
+    async def go():
+        async with front(store, base_path="/study1") as door, browser(door) as one:
+            link = link_of(store, door.url, "ada", "researcher")
+            asked = await one.get("/r/1/data")
+            assert asked.status == 401 and "Please open your link" in asked.text
+            (cookie,) = asked.headers.getall("Set-Cookie")
+            assert "HttpOnly" in cookie and "Path=/study1/" in cookie and "Max-Age=600" in cookie
+            assert (await one.get(link)).headers["Location"] == "/study1/r/1/data"
+            assert (await one.get(link)).headers["Location"] == "/study1/r/1/"  # once
+            name = f"onedemo-{door.port}-tab"
+            for hostile in ("//evil.example", "..%2f", "a" * 21, "DATA"):
+                answer = await one.get(link, Cookie=f"{name}={hostile}")
+                assert answer.headers["Location"] == "/study1/r/1/", hostile
+
+    run(go())
+
+
+def test_an_address_without_anything_is_a_page_that_says_so(store):
+    async def go():
+        async with front(store, base_path="/study1") as door, browser(door) as one:
+            assert (await one.get("/nothing", Accept="text/html")).status == 401
+            await one.get(link_of(store, door.url, "ann"))
+            for path in ("/nothing", "/r/1/nothing", "/r/1/press", "/r/1/clips/99.jpg/x"):
+                answer = await one.get(path, Accept="text/html,*/*")
+                assert answer.status == 404 and "There is nothing at this address" in answer.text, path
+                assert 'href="/study1/r/1/"' in answer.text
+                assert answer.headers["Content-Security-Policy"] == assets.POLICY
+            assert (await one.get("/nothing", Accept="*/*")).headers["Content-Type"].startswith("text/plain")
 
     run(go())
 

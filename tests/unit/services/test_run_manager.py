@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sqlite3
 from contextlib import closing
 from dataclasses import asdict
 
@@ -88,9 +89,70 @@ def test_a_run_starts_from_the_predictor_of_another(study):
     assert (study.trainer.directory / "start.pt").read_bytes() == newest.read_bytes()
 
 
+def test_a_new_run_has_the_settings_that_were_chosen(study):
+    chosen = {
+        "ratings.pretrain": 7,
+        "ratings.choice": "high",
+        "rollouts.total_steps": 5000,
+        "trpo.gamma": 0.1,
+    }
+    study.create(demo="falling", method="paper", seed=3, name="third", settings=chosen)
+    config, before = study.trainer.config, small_config()
+    assert (config.ratings.pretrain, config.ratings.choice) == (7, "high")
+    assert config.rollouts.total_steps == 5000
+    assert config.ratings.online == before.ratings.online  # as in the run before
+    assert config.trpo.gamma == before.trpo.gamma  # not offered
+
+
+def test_a_run_is_called_something_and_keeps_its_name(study):
+    study.describe("second", title="With marks", note="Bob left at half.")
+    told = {run["id"]: (run["title"], run["note"]) for run in study._store.runs.all()}
+    assert told == {"first": ("", ""), "second": ("With marks", "Bob left at half.")}
+    for fields, words in (
+        ({"run": "third"}, "no run 'third'"), ({"title": "x" * 65}, "a title is up to 64"),
+        ({"note": "a\nb"}, "a note is up to 500"), ({"title": "a\u202eb"}, "a title"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=words):
+            study.describe(**({"run": "second", "title": "", "note": ""} | fields))
+
+
+def test_a_run_is_deleted_with_its_files_unless_somebody_works_on_it(study, monkeypatch):
+    place = study.trainer.data_dir / "runs"
+    assert sum(study._store.ratings.by_class("second")) > 0 and (place / "second" / "snapshots").is_dir()
+    with pytest.raises(UserError, match="'first' is the one being served; open another one first"):
+        study.delete("first")
+    with pytest.raises(UserError, match="no run 'third'"):
+        study.delete("third")
+    with (
+        hold(place / "second" / "lock"),
+        pytest.raises(UserError, match="another onedemo works on run 'second'; stop that first"),
+    ):
+        study.delete("second")
+    assert (place / "second" / "snapshots").is_dir()
+    before = sorted(path.name for path in (place / "second").rglob("*"))
+    with monkeypatch.context() as patch:
+        patch.setattr(study._store.runs, "delete", full_disk)
+        with pytest.raises(sqlite3.OperationalError):
+            study.delete("second")
+    assert sorted(path.name for path in (place / "second").rglob("*")) == before
+    study.delete("second")
+    assert [run["id"] for run in study._store.runs.all()] == ["first"]
+    assert [path.name for path in place.iterdir()] == ["first"]
+    assert sum(study._store.ratings.by_class("second")) == 0
+    assert add_run(study._store, study.trainer.data_dir, study.trainer.demo, small_config(), name="second")
+
+
+def full_disk(run):
+    raise sqlite3.OperationalError("disk is full")
+
+
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
+        ({"settings": {"ratings.pretrain": 0}}, "ratings.pretrain must be at least 1"),
+        ({"settings": {"ratings.clip_seconds": 9}}, "ratings.clip_seconds must be 0.05 to 5 s"),
+        ({"settings": {"ratings.online": 1.5}}, "ratings.online must be a whole number, got 1.5"),
+        ({"settings": {"ratings.choice": "magic"}}, "ratings.choice"),
         ({"method": "magic"}, "there is no method 'magic'"),
         ({"name": "first"}, "run 'first' exists already"),
         ({"name": "no/slash"}, "a name is 1 to 64"),
@@ -138,6 +200,10 @@ def test_actions_take_the_fields_they_name_and_no_others(study):
     actions = Actions(Served(study))
     actions.do(ada, {"do": "open run", "run": "second"})
     assert study.trainer.run == "second"
+    actions.do(ada, {"do": "describe run", "run": "first", "title": " Before ", "note": ""})
+    assert study._store.runs.all()[0]["title"] == "Before"
+    actions.do(ada, {"do": "delete run", "run": "first"})
+    assert len(study._store.runs.all()) == 1
     actions.do(ada, {"do": "exclude", "rater": ada.id})
     assert study._store.ratings.left_out("second") == {ada.id}
     for body in (
@@ -145,7 +211,10 @@ def test_actions_take_the_fields_they_name_and_no_others(study):
         {"do": "open run", "run": "a\nb"}, {"do": "open run", "run": "x" * 101},
         {"do": "exclude", "rater": True}, {"do": "exclude", "rater": 99},
         {"do": "exclude", "rater": ada.id, "more": 1},
+        {"do": "delete run", "run": 2}, {"do": "describe run", "run": "second", "title": "a"},
+        {"do": "new run", "demo": "falling", "method": "paper", "seed": 0, "name": "", "predictor_from": "",
+         "ratings.pretrain": [1]},
     ):  # fmt: skip
-        with pytest.raises(ValueError, match=r"action|rater|run is"):
+        with pytest.raises(ValueError, match=r"action|rater|run is|setting"):
             actions.do(Rater(id=ada.id, name="ada", role="researcher"), body)
     assert study.trainer.run == "second"
