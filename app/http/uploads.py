@@ -300,13 +300,12 @@ def _seconds(value: Any, name: str) -> float:
 def _options(body: Any) -> Options:
     if not isinstance(body, dict) or not set(body) <= {"start", "end", "crop", "mirror"}:
         raise ValueError("a part of a video has start, end, crop and mirror")
-    times = {
-        name: None if body.get(name) is None else _seconds(body[name], name) for name in ("start", "end")
-    }
-    crop = body.get("crop")
-    if crop is not None:
-        if not (isinstance(crop, list) and len(crop) == 4 and all(type(side) is int for side in crop)):
+    start, end = (None if body.get(name) is None else _seconds(body[name], name) for name in ("start", "end"))
+    given, crop = body.get("crop"), None
+    if given is not None:
+        if not (isinstance(given, list) and len(given) == 4 and all(type(side) is int for side in given)):
             raise ValueError("the part of the picture is four whole numbers: x, y, width, height")
-        crop = tuple(max(-1, min(side, 1 << 20)) for side in crop)
-    check_options(**times, crop=crop, fps=30.0)
-    return Options(**times, crop=crop, mirror=body.get("mirror") is True)
+        x, y, width, height = (max(-1, min(side, 1 << 20)) for side in given)
+        crop = (x, y, width, height)
+    check_options(start=start, end=end, crop=crop, fps=30.0)
+    return Options(start=start, end=end, crop=crop, mirror=body.get("mirror") is True)

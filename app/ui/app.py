@@ -127,7 +127,7 @@ class Page:
 
     def tabs(self, role: str) -> list[str]:
         """The tabs of a role as their addresses end, the first one first."""
-        return [maker.title.lower() for maker in tabs_of(role, compare=self._compare)]
+        return [vars(maker)["title"].lower() for maker in tabs_of(role, compare=self._compare)]
 
     def _open(self, rater_id: int, token: str) -> Session | None:
         with self._lock:

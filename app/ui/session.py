@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import secrets
 import threading
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 from onedemo.app.annotation.presses import Press
 from onedemo.app.tabs.context import TabContext
@@ -17,16 +18,7 @@ from onedemo.app.templates import render
 from onedemo.types import Status
 
 _BRAND = (47, 93, 196)
-
-
-class TabMaker(Protocol):
-    """What makes a tab, such as its class; ``title`` is known before."""
-
-    title: str
-
-    def __call__(self, context: TabContext, /) -> Tab:
-        """Adds its elements to a session."""
-        ...
+TabMaker = Callable[[TabContext], Tab]
 
 
 class Session:
