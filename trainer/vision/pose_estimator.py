@@ -123,6 +123,7 @@ def shipped_track(demo: Demo) -> Track | None:
 
 def keep_track(demo: Demo, track: Track) -> None:
     """Keeps what a demo shows of the robot beside its video."""
+    assert track.doubt is not None, "the pose estimator says how sure it is"
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, pose=track.pose, motion=track.motion, doubt=track.doubt)
     write_atomic(_track_file(demo), buffer.getvalue())
