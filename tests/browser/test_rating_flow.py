@@ -143,6 +143,11 @@ def test_a_mark_by_dragging_goes_with_the_rating(chromium, site, viewport):
         page.mouse.move(box["x"] + 0.55 * box["width"], y, steps=4)
         page.mouse.up()
         page.wait_for_selector(".od-bar-note >> text=Goes wrong from 0.10 to 0.20 s")
+        page.wait_for_selector(
+            ".od-clip [data-still]"
+        )  # it stands still, and a button shows that it can go on
+        page.click("[data-play]")
+        page.wait_for_selector(".od-clip .od-player:not([data-still])")
         press_and_wait(page, site, lambda: page.keyboard.press("2"))
         assert marks_of(site) == [(clip, 2, 13, 25)]  # pictures 3 to 5: steps 13 to 24
         second = shown_clip(page)
