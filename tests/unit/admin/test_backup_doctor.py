@@ -166,7 +166,7 @@ def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir
 
 @pytest.mark.parametrize("at", [None, 0.001, 0.003, 0.99])  # cut off, or turned: in the seal, the rest
 def test_a_damaged_picture_is_set_aside(tmp_path, at):
-    frames = np.random.default_rng(0).integers(0, 255, (2, 3, 36, 48, 3), np.uint8)
+    frames = np.random.default_rng(0).integers(0, 255, (2, 3, 360, 480, 3), np.uint8)
     plain, file = compose_clip(*frames), tmp_path / "000001.jpg"
     file.write_bytes(sealed(plain))
     assert read_whole(file, jpeg_fault) == sealed(plain) and jpeg_fault(plain) == ""
