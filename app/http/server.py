@@ -45,7 +45,7 @@ from onedemo.app.network.rate_limit import (
 from onedemo.app.network.refusals import Refusals, read_body, read_json
 from onedemo.app.services.demo_images import Pictures
 from onedemo.errors import UserError
-from onedemo.types import Status
+from onedemo.types import Demo, Status
 
 _CLOSE_S = 1.0
 """What requests that are being answered have when the port closes."""
@@ -61,6 +61,8 @@ _TLS_ALONE = {"Strict-Transport-Security": "max-age=31536000"}
 
 class Trained(Filmed, Protocol):
     """What the front needs to know of a trainer."""
+
+    demo: Demo
 
     def status(self) -> Status:
         """What the trainer is doing."""

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -272,8 +272,9 @@ class TrainingRun:
         learner, snapshot = self._opened, self.snapshot
         assert snapshot is not None, "the policy is trained on a snapshot"
         before = learner.env_steps
-        rollouts, stats = learner.iterate(snapshot)
-        stats |= self._true_reward(rollouts) | learner.diagnose(rollouts, snapshot)
+        rollouts, learned = learner.iterate(snapshot)
+        stats: dict[str, Any] = {**learned, **self._true_reward(rollouts)}
+        stats |= learner.diagnose(rollouts, snapshot)
         if self._drawn is not None:
             gallery = self._drawn.rollouts
             stats |= gallery.note(learner.iteration, rollouts, learner.frames_of, learner.demo_steps)
