@@ -11,7 +11,7 @@ from onedemo.storage.database import Database, now
 _COLUMNS = (
     "id", "demo", "demo_sha256", "seed", "config", "version", "created_at", "step_seconds", "title", "note",
 )  # fmt: skip
-_OF_A_RUN = ("tallies", "clips", "pairs", "iterations", "snapshots")
+_OF_A_RUN = ("tallies", "clips", "pairs", "iterations", "snapshots", "run_marks")
 
 
 class Runs:
