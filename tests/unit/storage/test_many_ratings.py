@@ -100,10 +100,10 @@ def test_the_data_tab_shows_the_tallies(store):
     given = {names[rater]: counts for rater, counts in store.ratings.counts(_RUN).items()}
     html = data_html(
         _RUN, "onedemo", store.ratings.tallies(_RUN), quality(rows), quality_by_rater(rows), given, people,
-        set(),
+        set(), {}, [], [],
     )  # fmt: skip
     assert "500 given: 500 used for training" in html
-    row = '<th scope="row">rater 3</th><td>before practice</td>'
+    row = '<th scope="row">rater 3</th><td class="od-text">before practice</td>'
     cells = store.ratings.tallies(_RUN)["rater 3", "pretrain"]
     assert row + "".join(f"<td>{cell or '·'}</td>" for cell in cells) + f"<td><b>{sum(cells)}</b>" in html
     assert sum(cells) == 4

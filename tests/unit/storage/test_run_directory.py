@@ -11,7 +11,7 @@ from onedemo.app.admin.doctor import _files
 from onedemo.app.cli.main import main
 from onedemo.core.names import check_new_name
 from onedemo.errors import UserError
-from onedemo.storage.run_directory import RunDirectory
+from onedemo.storage.run_directory import CLIP_FORMAT, RunDirectory
 from onedemo.storage.store import Store
 from onedemo.vision.encoders import demo_features
 
@@ -25,8 +25,8 @@ def test_where_files_lie(tmp_path):
     wanted = "config.toml lock log start.pt checkpoint.pt rollouts"
     assert [path.name for path in names] == wanted.split()
     assert files.snapshot(3) == files.path / "snapshots" / "000003.pt"
-    assert files.clip(12) == files.path / "clips" / "000012.jpg"
-    assert files.pair(7) == files.path / "pairs" / "000007.jpg"
+    assert files.clip(12) == files.path / "clips" / f"000012.{CLIP_FORMAT}.jpg"
+    assert files.pair(7) == files.path / "pairs" / f"000007.{CLIP_FORMAT}.jpg"
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -9,6 +9,7 @@ from onedemo.app.annotation.agreement import (
     trends,
 )
 from onedemo.app.tabs.data import data_html, line
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import Rater
 
 HOSTILE = "<img src=x>"
@@ -21,10 +22,11 @@ def html_of(values):
         for clip in range(40)
         for name, value in zip((HOSTILE, "Bob"), values(clip), strict=True)
     ]
+    given = {name: Counts(classes=(8,) * 5) for name in (HOSTILE, "Bob")}
     people = {name: Rater(id=k, name=name, role="annotator") for k, name in enumerate((HOSTILE, "Bob"), 1)}
     return data_html(
         "r", "onedemo", {(name, "online"): [1] * 5 for name in people}, quality(rows),
-        quality_by_rater(rows, intervals=False), {}, people, {2}, trends(rows), disputed(rows),
+        quality_by_rater(rows, intervals=False), given, people, {2}, trends(rows), disputed(rows),
         differences(rows),
     )  # fmt: skip
 

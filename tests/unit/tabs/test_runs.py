@@ -7,6 +7,7 @@ import pytest
 from onedemo.app.services.run_manager import OFFERED
 from onedemo.app.tabs.runs import chosen_runs, fields_of, runs_html, settings_of
 from onedemo.config import describe, load_config, to_toml
+from onedemo.storage.rating_counts import Counts
 from onedemo.types import Status
 
 
@@ -17,7 +18,7 @@ def run(name, **changes):
 
 def lines(runs, figures=None, status=None, current="here"):
     figures = {
-        each["id"]: {"ratings": 0, "comparisons": 0} | (figures or {}).get(each["id"], {}) for each in runs
+        each["id"]: {"ratings": Counts(), "comparisons": 0} | (figures or {}).get(each["id"], {}) for each in runs
     }
     status = status or Status(phase="online", message="")
     html = str(runs_html(runs, figures, current, status, [current]))
@@ -28,11 +29,11 @@ def lines(runs, figures=None, status=None, current="here"):
 def test_the_state_of_each_run_in_words():
     done = to_toml(load_config(None, {"rollouts.total_steps": 16_000}))
     runs = [run("old"), run("new"), run("done", config=done), run("here")]
-    figures = {"old": {"ratings": 5}, "done": {"env_steps": 16_000, "number": 1}}
+    figures = {"old": {"ratings": Counts(classes=(1,) * 5)}, "done": {"env_steps": 16_000, "number": 1}}
     shown = lines(runs, figures)
     assert list(shown) == ["here", "done", "new", "old"]  # the one at hand, then the newest first
     states = {name: re.search("<b data-state[^>]*>([^<]+)", row)[1] for name, row in shown.items()}
-    assert states == {"here": "Learning", "done": "Done", "new": "Not begun", "old": "Stopped"}
+    assert states == {"here": "Practising", "done": "Done", "new": "Not begun", "old": "Stopped"}
     assert "Pause" in shown["here"] and "Open" in shown["old"]
     assert "16 k <small>of 16 k" in shown["done"] and "0 <small>of 10.00 M" in shown["new"]
     failed = lines(runs, status=Status(phase="failed", message="", error="The disk is full."))["here"]

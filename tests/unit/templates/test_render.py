@@ -23,7 +23,11 @@ def test_a_value_is_escaped_in_text_and_in_attributes():
 
 def test_markup_of_another_template_is_escaped_once():
     player = render("watch.html:frame", source=HOSTILE)
-    guide = render("guide.html:guide", scale=[("Not", "at all")], examples=[(player, "5", "<b>")], keys=[])
+    example = {"rating": 5, "why": "<b>"}
+    guide = render(
+        "guide.html:guide", scale=[("Not", "at all")], cards=[(player, example)], words=[], video="", keys=[],
+        loading=False,
+    )  # fmt: skip
     assert str(player) in guide and "<span>&lt;b&gt;</span>" in guide
 
 
