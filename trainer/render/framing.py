@@ -140,7 +140,7 @@ def _extent(mover: Mover) -> Extent:
 
 
 def _beyond(film: np.ndarray, mover: Mover, view: View) -> bool:
-    """Whether a view is larger than the video, in which nothing but what moves is known: no use to anybody."""
+    """Whether a view is larger than the video, in which nothing but what moves is known."""
     tall, wide = film.shape[1:3]
     return mover.way is None and (view.width * mover.scale > wide or view.height * mover.scale > tall)
 
