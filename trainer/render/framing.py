@@ -109,6 +109,8 @@ def clip_sides(
         views = views_of(extents)
         return [_whole(film), *(_drawn(renderer, *pair) for pair in zip(tracks, views, strict=True))]
     first, *others = views_of([_extent(mover), *extents])
+    if _beyond(film, mover, first):
+        return clip_sides(renderer, film, None, robots)
     drawn = [_drawn(renderer, *pair) for pair in zip(tracks, others, strict=True)]
     return [_cut(film, mover, first), *drawn]
 
@@ -119,6 +121,8 @@ def film_sides(films: Sequence[np.ndarray], movers: Sequence[Mover | None]) -> l
         return [_whole(film) for film in films]
     known = [mover for mover in movers if mover is not None]
     views = views_of([_extent(mover) for mover in known])
+    if any(_beyond(*side) for side in zip(films, known, views, strict=True)):
+        return [_whole(film) for film in films]
     return [_cut(*side) for side in zip(films, known, views, strict=True)]
 
 
@@ -133,6 +137,12 @@ def _extent(mover: Mover) -> Extent:
         low=float((mover.floor - box[:, 3].max()) / scale),
         high=float((mover.floor - box[:, 1].min()) / scale),
     )
+
+
+def _beyond(film: np.ndarray, mover: Mover, view: View) -> bool:
+    """Whether a view is larger than the video, in which nothing but what moves is known."""
+    tall, wide = film.shape[1:3]
+    return mover.way is None and (view.width * mover.scale > wide or view.height * mover.scale > tall)
 
 
 def _whole(film: np.ndarray) -> Side:

@@ -251,7 +251,7 @@ class Renderer:
             rect = mujoco.MjrRect(0, 0, rect.width, rect.height)
             mujoco.mjr_render(rect, self._scene, self._mjr)
         mujoco.mjr_readPixels(pixels, None, rect, self._mjr)
-        (_paste if exact else _paste_quickly)(image[height - y1 : height - y0, x0:x1], pixels)
+        (_paste if by == _SCALE else _paste_quickly)(image[height - y1 : height - y0, x0:x1], pixels)
 
     def _look_at(self, rect: mujoco.MjrRect, window: Window, height: int, by: float) -> None:
         """Narrows the view to a part of the picture, pixels from its lower left corner, ``by`` for one."""

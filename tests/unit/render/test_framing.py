@@ -166,6 +166,15 @@ def test_where_all_moves_or_nothing_does_the_picture_is_shown_whole():
         assert side.pictures.shape == (5, CLOSE_HEIGHT, CLOSE_WIDTH, 3) and not side.known
 
 
+def test_a_view_that_would_be_larger_than_the_video_is_not_taken():
+    film, k = person(), np.arange(5)
+    mover = locate(film)
+    assert mover is not None
+    large = replace(mover.at(k), box=np.tile([1.0, 5.0, 315.0, 235.0], (5, 1)))
+    side = film_sides([film[k]], [large])[0]
+    assert side.pictures.shape[1:3] == (CLOSE_HEIGHT, CLOSE_WIDTH) and not side.known
+
+
 def test_a_clip_notes_what_the_page_draws(tmp_path):
     film = person()
     k = np.arange(10)

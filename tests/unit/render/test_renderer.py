@@ -198,7 +198,7 @@ def test_what_is_read_of_a_picture_holds_all_of_the_robot(monkeypatch):
     with Renderer() as renderer, Renderer(exact=False) as quick:
         cut, people = renderer.render(poses).astype(int), quick.render(poses).astype(int)
         monkeypatch.setattr(
-            renderer_module, "_part", lambda limbs, top, camera, width, height: (0, 0, width, height)
+            renderer_module, "_part", lambda limbs, top, camera, window, width, height: (0, 0, width, height)
         )
         assert np.array_equal(renderer.render(poses), cut)
     apart = np.abs(people - cut).max(-1)

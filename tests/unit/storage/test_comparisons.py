@@ -15,7 +15,8 @@ from onedemo.app.cli.main import main
 from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.errors import UserError
-from onedemo.render.renderer import RenderThread
+from onedemo.render.clip_image import read_about
+from onedemo.render.renderer import CloseUp, RenderThread
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
@@ -191,14 +192,18 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
         wait_for(lambda: len(store.comparisons.waiting_pairs("r")) == 6)
         ready = store.comparisons.waiting_pairs("r")
         picture = cv2.imread(str(RunDirectory(tmp_path, "r").pair(ready[0].id)))
-        assert picture.shape[1] == 3 * 480 + 2 * 12 and picture.shape[0] % 360 == 0
-        robots = picture[:360, 492:972].astype(int), picture[:360, 984:].astype(int)
+        about = read_about(RunDirectory(tmp_path, "r").pair(ready[0].id).read_bytes())
+        _, *sides = about["sides"]
+        assert len(sides) == 2 and sides[0]["width"] == sides[1]["width"]
+        robots = [picture[:540, side["at"] : side["at"] + 720].astype(int) for side in sides]
         assert np.abs(robots[0] - robots[1]).max() > 60
         left, _ = store.comparisons.pair_segments(ready[0].id)
         _, first = np.unique(
             learner.frames_of(ready[0].demo_step + np.arange(ready[0].steps)), return_index=True
         )
-        drawn = drawing.submit(lambda renderer: renderer.render(left.qpos[first])).result()[0]
+        close = CloseUp(width=720, height=540, scale=720 / sides[0]["width"], bottom=sides[0]["bottom"])
+        seen = left.qpos[first], np.array(sides[0]["eye"]), close
+        drawn = drawing.submit(lambda renderer: renderer.close_ups(*seen)).result()[0]
         apart = [np.abs(robot[..., ::-1] - drawn.astype(int)).mean() for robot in robots]
         assert apart[0] < 2 < apart[1]  # the left one is on the left
         queue.fill(learner, learner.random_rollouts())
