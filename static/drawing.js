@@ -54,7 +54,7 @@ const drawing = (() => {
       pen.lineTo(width, y);
       pen.stroke();
       pen.fillStyle = `rgb(${INK} / 55%)`;
-      if (y > 14 * unit) pen.fillText(`${z} m`, width - 8 * unit, y - 4 * unit);
+      if (y > 46 * unit) pen.fillText(`${z} m`, width - 8 * unit, y - 4 * unit);
     }
     // On the near side of the robot's lane, where it hides none.
     const near = (distance / (distance - 0.3)) * metre;
@@ -73,7 +73,7 @@ const drawing = (() => {
       pen.moveTo(x, y);
       pen.lineTo(x, y + (long ? 7 : 4) * unit);
       pen.stroke();
-      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${Math.abs(k / 4)}` : "0", x, y + 17 * unit);
+      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${Math.abs(k / 4)} m` : "0", x, y + 17 * unit);
     }
   }
 
@@ -130,16 +130,17 @@ const drawing = (() => {
     pen.fillText(word, left + 7 * unit, y + 4.5 * unit);
   }
 
-  function drawPace({ pen, height, unit }, pace) {
+  // At the top right, where there is neither a caption nor the floor.
+  function drawPace({ pen, width, unit }, pace) {
     const word = { 1: "1×", 0.5: "½×", 0.25: "¼×" }[pace];
     pen.font = `600 ${12 * unit}px system-ui, sans-serif`;
     pen.fillStyle = "rgb(255 255 255 / 72%)";
     pen.beginPath();
-    pen.roundRect(10 * unit, height - 32 * unit, 30 * unit, 22 * unit, 6 * unit);
+    pen.roundRect(width - 42 * unit, 12 * unit, 30 * unit, 22 * unit, 6 * unit);
     pen.fill();
     pen.fillStyle = `rgb(${INK} / 85%)`;
     pen.textAlign = "center";
-    pen.fillText(word, 25 * unit, height - 16.5 * unit);
+    pen.fillText(word, width - 27 * unit, 27.5 * unit);
   }
 
   return { drawPace, drawSide };

@@ -135,7 +135,7 @@ const clips = (() => {
 
     // How plainly head and foot are named: in the first practice clip, for some seconds.
     get labels() {
-      if (this.element.dataset.exercise !== "0") return 0;
+      if (this.element.dataset.exercise !== "1") return 0;
       const [from, to] = LABELS_S;
       return still.matches ? 1 : Math.max(0, Math.min(1, (to - this.seen) / (to - from)));
     }
