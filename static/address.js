@@ -1,5 +1,5 @@
-// Addresses of tabs: /r/N/data is the tab Data of N's page, /r/N/ the first one. Back, reload and a link lead
-// there, and the window is called after the tab and the run.
+// Addresses of tabs: /r/N/data is the tab Data of N's page; /r/N/ becomes that of the tab that the server shows
+// first. Back, reload and a link lead there, and the window is called after the tab and the run.
 //
 // Not a module: it must have run before Viser, which begins while the page is still being read.
 (() => {
@@ -20,11 +20,10 @@
     true,
   );
 
+  const inAddress = () => location.pathname.split("/").at(-1);
+
   // The button of the tab that the address names.
-  function named() {
-    const tab = location.pathname.split("/").at(-1);
-    return document.querySelector(tab ? `.od-tabs [data-tab="${CSS.escape(tab)}"]` : ".od-tabs button");
-  }
+  const named = () => document.querySelector(`.od-tabs [data-tab="${CSS.escape(inAddress())}"]`);
 
   // Asks for that tab until it is there: Viser listens to its key a moment after the header is drawn.
   async function follow() {
@@ -44,8 +43,9 @@
     const came = name !== before.page; // Viser connected, it may be anew: with the tab that it began with
     before = { page: name, tab };
     document.title = `${header.dataset.title} - onedemo`;
-    if (named()?.dataset.tab === tab) return;
-    if (came) follow();
+    if (inAddress() === tab) return;
+    if (!inAddress()) replaceState(null, "", tab);
+    else if (came) follow();
     else history.pushState(null, "", tab);
   }
   new MutationObserver(look).observe(document.documentElement, { childList: true, subtree: true });

@@ -24,17 +24,18 @@ def at(page, tab):
 def test_back_reload_a_link_and_the_title_know_the_tab(chromium, site):
     base, run = f"{site.url}/r/1/", site.trainer.run
     with opened(chromium, site.links["researcher"], SMALL) as page:
-        assert page.url == base
+        at(page, "start")
+        assert page.url == base + "start"
         page.click(".od-tabs >> text=Data")
         page.wait_for_url(base + "data")
-        page.keyboard.press("Alt+6")
+        page.keyboard.press("Alt+7")
         page.wait_for_url(base + "guide")
         assert page.title() == f"Guide - {run} - onedemo"
         page.go_back()
         at(page, "data")
         page.go_back()
-        at(page, "watch")
-        assert page.url == base and page.title() == f"Watch - {run} - onedemo"
+        at(page, "start")
+        assert page.url == base + "start" and page.title() == f"Start - {run} - onedemo"
         page.go_forward()
         at(page, "data")
         page.reload()
@@ -55,7 +56,7 @@ def test_back_reload_a_link_and_the_title_know_the_tab(chromium, site):
         assert page.locator(".mantine-Spotlight-search").count() == 0
         page.goto(f"{base}nothing")
         page.click("text=Go to your page")
-        at(page, "watch")
+        at(page, "start")
         page.goto(f"{base}data#x")  # would have become part of Viser's address
         at(page, "data")
     with opened(chromium, site.links["annotator"], SMALL) as page:

@@ -142,6 +142,7 @@ def test_head_and_foot_are_named_once_in_the_first_practice_clip(chromium, real)
     )
     counts = "(colours) => colours.map((colour) => (" + COUNT + ")(['left', colour]))"
     with opened(chromium, link) as page:
+        page.click("[data-introduction] button")
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
         assert min(page.evaluate(counts, [HEAD, FOOT])) > 100
         page.wait_for_function(f"(colours) => Math.max(...({counts})(colours)) < 5", arg=[HEAD, FOOT])
