@@ -42,10 +42,11 @@ const drawing = (() => {
   // Lines every half metre above the floor, and marks on the floor, which stay where they are in the world.
   function drawScale({ pen, width, height, unit }, side, frame, metre, at) {
     const [cameraHeight, distance] = side.camera;
+    if (!(metre > 0)) return;
     pen.font = `${11 * unit}px system-ui, sans-serif`;
     pen.lineWidth = unit;
     pen.textAlign = "right";
-    for (let z = 0.5; at([0, z])[1] > 0; z += 0.5) {
+    for (let z = 0.5; z < side.bottom + height / metre; z += 0.5) {
       const y = Math.round(at([0, z])[1]) + unit / 2;
       if (y > height) continue;
       pen.strokeStyle = `rgb(${INK} / 13%)`;
@@ -65,9 +66,9 @@ const drawing = (() => {
     pen.strokeStyle = pen.fillStyle = `rgb(${INK} / 55%)`;
     pen.textAlign = "center";
     const first = Math.ceil((eye - side.eye[0] - middle / near) * 4);
-    for (let k = first; ; k += 1) {
+    const last = Math.floor((eye - side.eye[0] + (width - middle) / near) * 4);
+    for (let k = first; k <= last; k += 1) {
       const x = Math.round(middle + (side.eye[0] + k / 4 - eye) * near);
-      if (x > width) break;
       const long = k % 2 === 0;
       pen.beginPath();
       pen.moveTo(x, y);

@@ -96,7 +96,7 @@ const clips = (() => {
       return this.ready ? this.entry.about.frames : 1;
     }
     get frame() {
-      return Math.min(this.frames - 1, Math.floor(this.time * this.fps + 1e-6));
+      return Math.max(0, Math.min(this.frames - 1, Math.floor(this.time * this.fps + 1e-6)));
     }
 
     draw() {
@@ -243,7 +243,7 @@ const clips = (() => {
   let last = 0;
   let running = false;
   function tick(now) {
-    const seconds = Math.min(0.1, (now - last) / 1000);
+    const seconds = Math.max(0, Math.min(0.1, (now - last) / 1000)); // a frame may have begun before it was asked for
     last = now;
     let any = false;
     for (const player of players.values()) {

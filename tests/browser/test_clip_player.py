@@ -115,6 +115,18 @@ def test_first_pose_and_paths_are_drawn_on_both_sides_and_only_then(chromium, re
         assert plain == [page.evaluate(COUNT, [side, c]) for side in ("left", "right") for c in (HEAD, FOOT)]
 
 
+def test_a_frame_that_began_before_it_was_asked_for_does_not_hang_the_page(chromium, real):
+    late = "const ask = requestAnimationFrame; requestAnimationFrame = (go) => ask((now) => go(now - 500));"
+    with opened(chromium, real.links["annotator"]) as page:
+        shown_clip(page)
+        page.add_init_script(late)
+        page.reload()
+        shown_clip(page)
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press(" ")
+        assert page.evaluate("1 + 1") == 2
+
+
 def test_a_clip_has_the_pixels_of_the_screen(chromium, real):
     with opened(chromium, real.links["annotator"]) as page:
         shown_clip(page)
@@ -142,7 +154,7 @@ def test_head_and_foot_are_named_once_in_the_first_practice_clip(chromium, real)
     )
     counts = "(colours) => colours.map((colour) => (" + COUNT + ")(['left', colour]))"
     with opened(chromium, link) as page:
-        page.click("[data-introduction] button")
+        page.click(".od-intro [data-go]")
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
         assert min(page.evaluate(counts, [HEAD, FOOT])) > 100
         page.wait_for_function(f"(colours) => Math.max(...({counts})(colours)) < 5", arg=[HEAD, FOOT])

@@ -153,6 +153,16 @@ def test_practice_is_one_column_in_the_middle_at_every_size(chromium, site):
     store = site.trainer.store
     new = store.accounts.ensure("new", "annotator")
     with opened(chromium, issue_link(store, read_secret(store.path.parent), new, site.url)) as page:
+        page.wait_for_selector(".od-intro")
+        for width, height in SIZES:
+            page.set_viewport_size({"width": width, "height": height})
+            video, words = (page.locator(f".od-intro > {part}").bounding_box() for part in ("video", "div"))
+            left = min(box["x"] for box in (video, words))
+            right = max(box["x"] + box["width"] for box in (video, words))
+            assert video["width"] > min(width, height) * 0.3, ("introduction", width, height, video)
+            assert words["width"] > min(width * 0.4, 300), ("introduction", width, height, words)
+            assert 0 <= left and right <= width, ("introduction", width, height, left, right)
+        page.click(".od-intro [data-go]")
         page.wait_for_selector(".od-practice [data-frame]", timeout=60_000)
         for size in SIZES:
             check(page, size, "practice")
