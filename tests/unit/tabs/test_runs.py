@@ -18,7 +18,8 @@ def run(name, **changes):
 
 def lines(runs, figures=None, status=None, current="here"):
     figures = {
-        each["id"]: {"ratings": Counts(), "comparisons": 0} | (figures or {}).get(each["id"], {}) for each in runs
+        each["id"]: {"ratings": Counts(), "comparisons": 0} | (figures or {}).get(each["id"], {})
+        for each in runs
     }
     status = status or Status(phase="online", message="")
     html = str(runs_html(runs, figures, current, status, [current]))
