@@ -87,12 +87,12 @@
   function asking(button, text, again, done) {
     button.textContent = text;
     button.addEventListener("click", () => {
-      if ("sure" in button.dataset) return done();
-      button.dataset.sure = "";
+      if ("asked" in button.dataset) return done();
+      button.dataset.asked = "";
       button.textContent = again;
     });
     button.addEventListener("blur", () => {
-      delete button.dataset.sure;
+      delete button.dataset.asked;
       button.textContent = text;
     });
   }
