@@ -319,8 +319,8 @@ const charts = (() => {
         return { ...line, value: at == null ? null : columns[k][at], raw: at == null ? null : columns[Math.max(0, k - 1)][at] };
       });
       const main = rows.filter(({ faint, level }) => !faint && !level);
-      this.value.textContent = main.length > 1 ? "" : told(main[0]?.value);
       const compared = this.group.element.dataset.several !== undefined;
+      this.value.textContent = compared || main.length > 1 ? "" : told(main[0]?.value); // else in the legend
       // Of several runs those without a value, too, so that nobody looks for their line.
       const empty = ({ run, colour }) => ({ label: run, ...look(colour ?? 1), value: null });
       const listed = compared
@@ -346,8 +346,12 @@ const charts = (() => {
       const near = this.#marks().filter(({ x: at }) => Math.abs(u.valToPos(at, "x") - u.cursor.left) < 7);
       tip.replaceChildren(title, ...items, ...near.map(({ text }) => Object.assign(document.createElement("span"), { textContent: text })));
       const left = u.over.offsetLeft + u.cursor.left;
-      const right = left > this.place.clientWidth / 2;
-      Object.assign(tip.style, { left: right ? "" : `${left + 14}px`, right: right ? `${this.place.clientWidth - left + 14}px` : "" });
+      // Within the charts: beside them the robot's canvas would cover it.
+      const [around, place] = [this.group.element.getBoundingClientRect(), this.place.getBoundingClientRect()];
+      const [least, most] = [around.left - place.left, around.right - place.left - tip.offsetWidth];
+      const before = left - 14 - tip.offsetWidth;
+      const at = left > this.place.clientWidth / 2 && before >= least ? before : left + 14;
+      tip.style.left = `${Math.max(least, Math.min(at, most))}px`;
     }
 
     #item({ label, stroke, dash, value }) {

@@ -126,7 +126,7 @@
     if (data.to) toTab(data.to);
     else if (data.goto) goTo(data.goto);
     else if (data.revoke || data.revokeLink) ask(button);
-    else if ("sure" in data) end(button);
+    else if (button.matches(".od-sure [data-sure]")) end(button);
     else if ("copy" in data) {
       const text = data.copy === "all" ? linksIn(button.closest(".od-links")) : button.closest("li").querySelector("input").value;
       copy(text).then(

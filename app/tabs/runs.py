@@ -55,10 +55,7 @@ class Runs:
         self._client, self._drawn = context.client, []
         self._curves = [
             charts.Comparison(gui, key, title, dark=context.dark)
-            for key, title in (
-                ("predicted", "Predicted rating (1 to 5)"),
-                ("true_reward", "True reward of an episode (points; never trained on)"),
-            )
+            for key, title in (("predicted", "Predicted rating"), ("true_reward", "True reward"))
         ]
         # The forms are drawn once, so that nothing that is being filled in is lost.
         runs = self._store.runs.all()

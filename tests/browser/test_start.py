@@ -64,7 +64,7 @@ def test_somebody_is_invited_rates_is_seen_and_is_revoked(chromium, site):
             press_and_wait(other, site, lambda: other.keyboard.press("4"))
             row.locator("text=1 browser").wait_for(timeout=20_000)
             row.locator('td[data-label="Ratings"]:has-text("1")').wait_for(timeout=20_000)
-            assert "now, in 1 browser" in row.inner_text()
+            assert "now; 1 browser signed in" in row.inner_text()
             page.wait_for_selector(f".od-by >> text={LONG}")
             page.wait_for_selector(".od-steps >> text=1 of 200")
             row.locator("[data-revoke]").click()

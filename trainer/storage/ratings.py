@@ -297,10 +297,10 @@ class Ratings:
         return self._counting.of(run, self.left_out(run))
 
     def tallies(self, run: str) -> dict[tuple[str, str], list[int]]:
-        """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted."""
+        """Ratings of 1 to 5 that hold in a run, by (rater's name, stage), sorted by name, then time."""
         rows = self._database.rows(
             "SELECT name, stage, value, ratings FROM tallies JOIN raters ON raters.id = rater_id"
-            " WHERE run = ? AND ratings > 0 ORDER BY name, stage",
+            " WHERE run = ? AND ratings > 0 ORDER BY name, stage = 'online', stage",
             (run,),
         )
         counts: dict[tuple[str, str], list[int]] = {}
