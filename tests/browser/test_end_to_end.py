@@ -92,7 +92,7 @@ def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
     until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 180)
     with opened(chromium, links["researcher"], TINY) as page:
         page.click('.od-tabs >> text="Watch"')
-        page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 300")
+        page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 150")
         where = page.locator("canvas[data-engine]").bounding_box()
         seen: set[bytes] = set()  # empty, drawn, and moving
         until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 180)

@@ -138,7 +138,7 @@ def test_rate_is_one_column_in_the_middle_at_every_size_and_in_every_state(chrom
         while page.locator(".od-clip").count():
             shown_clip(page)
             press_and_wait(page, site, lambda: page.keyboard.press("3"))
-        page.wait_for_selector(".od-waiting >> text=Nothing to rate just now")
+        page.wait_for_selector(".od-waiting >> h2")
         for size in SIZES:
             check(page, size, "waiting", sides=0, answers=0)
         site.trainer.set_status(target_ratings=1)

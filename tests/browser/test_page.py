@@ -87,7 +87,7 @@ def drawn(page, side: str) -> list[int]:
     return page.evaluate(
         "side => { const c = document.querySelector(`.od-clip canvas[data-side=${side}]`);"
         " const all = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
-        " return Array.from({ length: 2400 }, (_, i) => all[4 * 71 * i]) }",
+        " return Array.from({ length: 2400 }, (_, i) => all[4 * Math.floor(i * all.length / 4 / 2400)]) }",
         side,
     )
 
@@ -344,12 +344,12 @@ def test_researcher_sees_the_robot_move(chromium, site):
             site.trainer.run, 1, snapshot=1, env_steps=16000, stats={"predicted": 1.5, "kl": 0.01}
         )
         until(lambda: page.locator(".uplot:visible").count() == 1)  # what has no values yet is not drawn
-        page.click("text=Pause")
+        page.click(".od-controls >> text=Pause")
         until(lambda: site.trainer.calls == ["pause"])
-        page.click("text=Resume")
+        page.click(".od-controls >> text=Resume")
         until(lambda: site.trainer.calls == ["pause", "resume"])
-        page.click("text=Stop")
-        page.click("text=Press again to stop")
+        page.click(".od-controls >> text=Stop")
+        page.click(".od-controls >> text=Press again to stop")
         until(lambda: site.trainer.calls == ["pause", "resume", "stop"])
 
 
