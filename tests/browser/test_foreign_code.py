@@ -16,6 +16,7 @@ import viser
 from viser import _messages
 
 from browser.test_page import DESKTOP, until
+from onedemo.demos.video import write_webm
 
 pytestmark = pytest.mark.seam
 

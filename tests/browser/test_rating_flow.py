@@ -522,7 +522,7 @@ def test_presses_of_others_pages_and_hostile_ones_change_nothing(chromium, site)
         opened(chromium, site.links["second annotator"]) as other,
     ):
         clip, others_clip = shown_clip(page), shown_clip(other)
-        path = page.evaluate("() => location.pathname") + "press"
+        path = page.evaluate("() => new URL('press', location.href).pathname")
 
         def token(of):
             return of.locator(".od-header").get_attribute("data-page")
