@@ -54,7 +54,7 @@ def test_whether_ratings_are_good_and_who_is_left_out(chromium, site):
         page.locator("tr", has_text="Ann").first.locator("[data-do]").click()
         page.wait_for_selector(".od-nobody >> text=Everybody is excluded from training.", timeout=20_000)
         to_tab(page, "Watch")
-        page.wait_for_selector(".od-nobody:visible >> text=continues with its last predictor")
+        page.wait_for_selector(".od-nobody:visible >> text=continues with its last reward model")
         assert site.trainer.store.ratings.count_for_training(run) == 0
         to_tab(page, "Data")
         for name in ("Ann", "Bob <i>"):
@@ -76,7 +76,7 @@ def test_skips_and_their_reasons_are_counted_and_exported(chromium, site, tmp_pa
     store.ratings.undo(ids[2], ann)
     with opened(chromium, site.links["researcher"], SMALL) as page:
         to_tab(page, "Data")
-        row = page.locator("tr", has_text="=Ann").first
+        row = page.locator('[aria-label="Raters"] tr', has_text="=Ann").first
         row.wait_for(timeout=20_000)
         assert row.locator("td").all_inner_texts()[:2] == ["0", "2"]
         text = page.request.get(f"{site.url}/skips.csv?run={site.trainer.run}").text()
