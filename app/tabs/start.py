@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any
 
 from markupsafe import Markup
@@ -14,6 +14,7 @@ from markupsafe import Markup
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.storage.accounts import Link, Presence
+from onedemo.storage.database import now
 from onedemo.types import HALTED, Rater, Status
 
 _EVERY_S = 2.0
@@ -88,7 +89,7 @@ class Start:
         everybody, left_out = store.accounts.raters(), store.ratings.left_out(run)
         people = people_of(
             everybody, store.accounts.links(), store.accounts.presence(), given, left_out,
-            now=datetime.now(UTC),
+            now=datetime.fromisoformat(now()),
         )  # fmt: skip
         for row in store.runs.iterations(run, after=self._iteration):
             self._iteration = row["number"]
