@@ -31,6 +31,7 @@ _APP_ONLY = (
     "packaging",
     "pyarrow",
     "rich",
+    "segno",
     "viser",
     "zstandard",
 )
