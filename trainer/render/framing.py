@@ -72,7 +72,7 @@ def views_of(extents: Sequence[Extent]) -> list[View]:
     """Views of one size, in which every mover stays for the whole clip."""
     across = max(e.right - e.left for e in extents) + 2 * _BESIDE
     low, high = min(e.low for e in extents), max(e.high for e in extents)
-    together = high - low <= _APART
+    together = high - low <= _APART or all(extent.low < _NEAR_FLOOR for extent in extents)
     lows, highs = ([low] * len(extents), [high] * len(extents)) if together else (
         [e.low for e in extents], [e.high for e in extents]
     )  # fmt: skip

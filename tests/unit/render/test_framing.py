@@ -59,6 +59,12 @@ def test_one_size_for_all_with_the_floor_where_somebody_is_near_it():
     assert 0.4 < alone.bottom < 0.7 and alone.height < left.height  # closer: nobody is near the floor
 
 
+def test_one_that_leaps_from_the_floor_and_one_that_stays_there_have_one_height():
+    leaps = Extent(left=-0.5, right=0.5, low=0.1, high=2.6)
+    left, right = views_of([leaps, STANDING])
+    assert left.bottom == right.bottom and left.height == right.height
+
+
 def test_movers_at_very_different_heights_keep_their_size_but_not_one_height():
     high = replace(FLYING, low=4.0, high=4.9)
     left, right = views_of([high, STANDING])
