@@ -146,8 +146,10 @@ def test_a_clip_has_the_pixels_of_the_screen(chromium, real):
 
 
 def test_head_and_foot_are_named_once_in_the_first_practice_clip(chromium, real):
+    from helpers.fake_trainer import drawn_track
     from onedemo.app.http.tokens import issue_link, read_secret
 
+    real.trainer.track = drawn_track()  # five clips to practise with
     store = real.trainer.store
     link = issue_link(
         store, read_secret(store.path.parent), store.accounts.ensure("new", "annotator"), real.url
