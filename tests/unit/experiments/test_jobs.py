@@ -3,6 +3,7 @@
 What whole runs achieve is tested on the finished ones, in ``test_finished_runs``.
 """
 
+import os
 from dataclasses import replace
 
 import cv2
@@ -52,6 +53,9 @@ def quicker(job):
 
 
 @pytest.mark.seam
+@pytest.mark.skipif(
+    not os.environ.get("ONEDEMO_LONG"), reason="whole trainings, over a minute: ONEDEMO_LONG=1 (make chaos)"
+)
 def test_a_table_from_its_plan_to_its_files(results, tmp_path):
     """The backflip's quick form, without preferences, which take longest and have a test of their own."""
     jobs = [quicker(job) for job in backflip.plan((SEED,), quick=True) if job.kind != "preferences"]
