@@ -95,7 +95,10 @@ def clear_left_over(place: Path, prefix: str) -> None:
 def _made_and_locked(place: Path, prefix: str) -> tuple[Path, int]:
     while True:
         path = Path(tempfile.mkdtemp(dir=place, prefix=prefix))
-        handle = os.open(path, os.O_RDONLY)
+        try:
+            handle = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:  # somebody cleared it away before it was opened
+            continue
         try:
             with suppress(OSError):  # a file system without locks: then nobody clears up there, either
                 fcntl.flock(handle, fcntl.LOCK_EX)

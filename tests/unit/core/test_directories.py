@@ -5,6 +5,7 @@ import signal
 import stat
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -79,3 +80,14 @@ def test_one_that_nobody_has_any_more_is_gone(tmp_path):
     assert place.path.exists()
     del place
     assert not list(tmp_path.iterdir())
+
+
+def test_many_that_begin_at_once_clear_nothing_of_one_another_away(tmp_path):
+    def make(_):
+        for _ in range(60):
+            with Workshop(tmp_path, ".half.") as ours:
+                assert ours.is_dir()
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(make, range(8)))
+    assert list(tmp_path.iterdir()) == []
