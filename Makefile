@@ -39,7 +39,7 @@ check: .venv/.installed-test
 chaos: .venv/.installed-test
 	@mkdir -p promises
 	ONEDEMO_LONG=1 $(BIN)/python -m pytest tests/system/test_resume.py tests/system/test_faults.py \
-	  tests/browser/test_line.py tests/unit/experiments/test_jobs.py
+	  tests/browser/test_line.py tests/browser/test_end_to_end.py tests/unit/experiments/test_jobs.py
 	$(BIN)/python tests/data/videos.py --long
 	PYTHONPATH=tests $(BIN)/python tests/load/fuzz_http.py --json promises/fuzz.json
 	PYTHONPATH=tests $(BIN)/python tests/load/attack_http.py --json promises/attack.json

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import shutil
 import sqlite3
 import time
@@ -113,6 +114,7 @@ def test_ratings_teach_another_body_filmed_by_anybody(chromium, serving, tmp_pat
     rate_five_and_look(chromium, serving, tmp_path, "--demo", "figure")
 
 
+@pytest.mark.skipif(not os.environ.get("ONEDEMO_LONG"), reason="as the test above, longer: ONEDEMO_LONG=1")
 def test_ratings_teach_the_papers_method(chromium, serving, tmp_path):
     rate_five_and_look(chromium, serving, tmp_path, "--method", "paper", method="paper")
 

@@ -29,6 +29,10 @@ TINY = {
     "practice.random_lanes": 8, "practice.bank_tries": 500,
 }  # fmt: skip
 
+LONG = pytest.mark.skipif(
+    not os.environ.get("ONEDEMO_LONG"), reason="whole trainings: ONEDEMO_LONG=1 (make chaos)"
+)
+
 
 def tiny(**changes):
     """Settings of a job of kind "method": one iteration after 8 ratings, with 6 more."""
@@ -53,9 +57,7 @@ def quicker(job):
 
 
 @pytest.mark.seam
-@pytest.mark.skipif(
-    not os.environ.get("ONEDEMO_LONG"), reason="whole trainings, over a minute: ONEDEMO_LONG=1 (make chaos)"
-)
+@LONG
 def test_a_table_from_its_plan_to_its_files(results, tmp_path):
     """The backflip's quick form, without preferences, which take longest and have a test of their own."""
     jobs = [quicker(job) for job in backflip.plan((SEED,), quick=True) if job.kind != "preferences"]
@@ -88,6 +90,7 @@ def test_a_table_from_its_plan_to_its_files(results, tmp_path):
 
 
 @pytest.mark.seam
+@LONG
 def test_a_switch_of_the_ablation_and_a_predictor_of_another_move_change_something(cache, tmp_path):
     plain = document.plain(method.run(tiny(), SEED, tmp_path / "plain", cache))
     assert plain["ratings"] == sum(plain["ratings_by_class"]) == 14
