@@ -57,10 +57,14 @@ const charts = (() => {
     }
   }
 
+  function feedOf(run) {
+    if (!feeds.has(run)) feeds.set(run, new Feed(run));
+    return feeds.get(run);
+  }
+
   // Calls a function with what is known of a run, now and whenever there is more; returns what ends that.
   function follow(run, read) {
-    if (!feeds.has(run)) feeds.set(run, new Feed(run));
-    const feed = feeds.get(run);
+    const feed = feedOf(run);
     feed.readers.add(read);
     if (feed.colour) read(feed);
     ask();
@@ -321,10 +325,10 @@ const charts = (() => {
       const main = rows.filter(({ faint, level }) => !faint && !level);
       const compared = this.group.element.dataset.several !== undefined;
       this.value.textContent = compared || main.length > 1 ? "" : told(main[0]?.value); // else in the legend
-      // Of several runs those without a value, too, so that nobody looks for their line.
+      // Of several runs those without a value, too, so that nobody looks for their line; one may be new here.
       const empty = ({ run, colour }) => ({ label: run, ...look(colour ?? 1), value: null });
       const listed = compared
-        ? this.group.runs.map((run) => main.find(({ label }) => label === run) ?? empty(feeds.get(run)))
+        ? this.group.runs.map((run) => main.find(({ label }) => label === run) ?? empty(feedOf(run)))
         : main;
       this.legend.replaceChildren(...(compared || main.length > 1 ? listed.map((line) => this.#item(line)) : []));
       this.place.setAttribute("aria-label", `${this.title}: ${main.map(({ label, value }) => (main.length > 1 ? `${label} ${told(value)}` : told(value))).join(", ")}`);
