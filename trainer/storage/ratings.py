@@ -285,7 +285,7 @@ class Ratings:
         return [counts.get(value, 0) for value in range(1, 6)]
 
     def count_for_training(self, run: str) -> int:
-        """How many ratings of a run are used for training: ``Counts.used``, without looking at every event."""
+        """How many ratings of a run train the net: ``Counts.used``, without looking at every event."""
         left_out = self.left_out(run)
         rows = self._database.rows(
             "SELECT rater_id, SUM(ratings) FROM tallies WHERE run = ? GROUP BY rater_id", (run,)
