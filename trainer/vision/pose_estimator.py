@@ -26,7 +26,8 @@ from onedemo.core.files import read_whole, write_atomic
 from onedemo.core.names import check_name
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
-from onedemo.sim import kinematics, vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import HEIGHT_SCALE, body_of
 from onedemo.types import Demo
 from onedemo.vision.encoders import Encoder
 
@@ -99,13 +100,14 @@ class PoseEstimator:
             fps: Frames per second.
         """
         poses = self.poses(features)
-        height = _smooth(poses[:, 0] / kinematics.HEIGHT_SCALE)
+        height = _smooth(poses[:, 0] / HEIGHT_SCALE)
         waves = poses[:, 1:].reshape(len(poses), -1, 2)
         short = 1 - np.minimum(np.linalg.norm(waves, axis=-1), 1)  # an unsure mean lies inside the circle
         angles = _smooth(np.unwrap(np.arctan2(waves[..., 0], waves[..., 1]), axis=0))
-        motion = kinematics.motion_of(_rate(height, fps), angles, _rate(angles, fps))
+        body = body_of(robot_named("hopper"))
+        motion = body.motion_of(_rate(height, fps), angles, _rate(angles, fps))
         return Track(
-            pose=kinematics.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
+            pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
             doubt=np.linalg.norm(short, axis=-1).astype(np.float32),
         )  # fmt: skip
 
@@ -154,7 +156,7 @@ def learn(
     Raises:
         UserError: If this machine cannot draw.
     """
-    spec = vector_env.spec(env_name)
+    spec = robot_named(env_name)
     model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
     path = cache_dir / f"{check_name(env_name)}-{model}-{encoder.name}-v{_VERSION}.npz"
     if (data := read_whole(path)) is not None:
@@ -193,7 +195,7 @@ def pictures(
                 yield drawing.render(q[None]).result()[0]
 
         features = encoder.encode(drawn())
-    return features, kinematics.pose(qpos[:, 1:]).astype(np.float32)
+    return features, body_of(robot_named(env_name)).pose(qpos[:, 1:]).astype(np.float32)
 
 
 def regress(
@@ -257,7 +259,7 @@ def _network(features: int) -> nn.Sequential:
     layer = nn.utils.skip_init
     return nn.Sequential(
         layer(nn.Linear, features, 256), nn.ReLU(), layer(nn.Linear, 256, 128), nn.ReLU(),
-        layer(nn.Linear, 128, kinematics.POSE),
+        layer(nn.Linear, 128, body_of(robot_named("hopper")).pose_size),
     )  # fmt: skip
 
 
