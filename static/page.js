@@ -3,7 +3,7 @@
 // is done here (static/player.js). Keys with Alt, such as those of the tabs, are Viser's. What only a
 // researcher has is in static/forms.js.
 //
-// Not a module: it must have run before Viser, which begins while the page is still being read.
+// Not a module: it must have run before Viser.
 const page = (() => {
   "use strict";
   const { forget, main, toggleSlow, toggleTrail, watchPlayers } = clips; // static/player.js
@@ -15,10 +15,24 @@ const page = (() => {
   dark.addEventListener("change", () => location.reload());
 
   // Viser sorts Gaussian splats with functions that it makes of text, which the policy of the page refuses, and
-  // loads that sorter with every page. No splats are drawn here: it waits for its code for ever.
+  // loads that sorter with every page. No splats are drawn here: it waits for its code for ever. Nor is the
+  // picture that lights the robot wanted before the robot is seen: to prepare it is the most of what a page
+  // costs where there is no GPU.
   const fetchAnything = window.fetch.bind(window);
-  window.fetch = (what, ...options) =>
-    String(what).startsWith("data:application/wasm") ? new Promise(() => {}) : fetchAnything(what, ...options);
+  const robotIsShown = new Promise((go) => {
+    const watch = new MutationObserver(() => {
+      if (!shown('.od-header[data-tab="watch"]')) return;
+      watch.disconnect();
+      go();
+    });
+    watch.observe(document.documentElement, { childList: true, subtree: true });
+  });
+  window.fetch = async (what, ...options) => {
+    const address = what.url ?? String(what);
+    if (address.startsWith("data:application/wasm")) return new Promise(() => {});
+    if (address.startsWith("data:image/jpeg")) await robotIsShown;
+    return fetchAnything(what, ...options);
+  };
 
   const shown = (selector) => document.querySelector(selector);
 
