@@ -14,25 +14,12 @@ const page = (() => {
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
-  // Viser sorts Gaussian splats with functions that it makes of text, which the policy of the page refuses, and
-  // loads that sorter with every page. No splats are drawn here: it waits for its code for ever. Nor is the
-  // picture that lights the robot wanted before the robot is seen: to prepare it is the most of what a page
-  // costs where there is no GPU.
+  // Viser loads two things with every page that are of no use here, and wait for their data for ever: a sorter
+  // of Gaussian splats, which makes functions of text, as the policy of the page forbids, and the picture that
+  // would light the robot (it has lamps: app/tabs/watch.py), dear to prepare without a GPU.
   const fetchAnything = window.fetch.bind(window);
-  const robotIsShown = new Promise((go) => {
-    const watch = new MutationObserver(() => {
-      if (!shown('.od-header[data-tab="watch"]')) return;
-      watch.disconnect();
-      go();
-    });
-    watch.observe(document.documentElement, { childList: true, subtree: true });
-  });
-  window.fetch = async (what, ...options) => {
-    const address = what.url ?? String(what);
-    if (address.startsWith("data:application/wasm")) return new Promise(() => {});
-    if (address.startsWith("data:image/jpeg")) await robotIsShown;
-    return fetchAnything(what, ...options);
-  };
+  window.fetch = (what, ...options) =>
+    /^data:(application\/wasm|image\/jpeg)/.test(what.url ?? what) ? new Promise(() => {}) : fetchAnything(what, ...options);
 
   const shown = (selector) => document.querySelector(selector);
 
@@ -408,8 +395,9 @@ const page = (() => {
       return false;
     }
   }
-  document.addEventListener("DOMContentLoaded", () => {
-    if (webgl()) return;
+  // Asked only where the page does not come: a context of WebGL takes a tenth of a second without a GPU.
+  seen(pageName, 3000).then((name) => {
+    if (name || webgl()) return;
     const note = document.createElement("p");
     note.className = "od-nowebgl";
     note.setAttribute("role", "alert");
