@@ -93,9 +93,13 @@ class Site:
             ).fetchall()
 
 
+_ports: list[int] = []
+"""Where the last front was: at the same address a browser has the page's files, compiled."""
+
+
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Site]:
-    """A front on a free port, with links for a researcher ("ada") and two annotators ("bo", "cy")."""
+    """A front with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
     from onedemo.app.http.server import Front
@@ -103,6 +107,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
     from onedemo.app.network.bind import Listening
     from onedemo.app.services.demo_images import Pictures
     from onedemo.app.ui.app import Page
+    from onedemo.errors import UserError
 
     trainer = StandIn(tmp_path)
     page = Page(
@@ -112,8 +117,13 @@ def site(tmp_path: Path) -> Iterator[Site]:
         guard_seconds=0.05,
         live_fps=2.0,  # without a GPU each frame costs a tenth of a second
     )
-    front = Front(page, Listening(port=0))
-    url = front.start()
+    try:
+        front = Front(page, Listening(port=_ports.pop() if _ports else 0))
+        url = front.start()
+    except UserError:  # somebody else has taken it meanwhile
+        front = Front(page, Listening(port=0))
+        url = front.start()
+    _ports.append(front.port)
     site = Site(trainer, page, front, url)
     secret = read_secret(tmp_path)
     for title, name in (("researcher", "ada"), ("annotator", "bo"), ("second annotator", "cy")):
