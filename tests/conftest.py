@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
 from collections.abc import Iterator
@@ -18,9 +19,33 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by 
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
+LONGEST = (
+    "test_rating_flow test_page test_end_to_end test_charts test_layout test_researcher test_served_product"
+    " test_line test_faults test_trainer test_clip_player test_jobs test_accessible test_cli test_renderer"
+    " test_learner test_backup_doctor test_addresses_and_demos test_resume test_start test_speed test_kills"
+    " test_installed test_foreign_code test_custom test_security test_speed_pictures test_sandboxed_decoder"
+    " test_warm_start test_pictures test_warp_physics test_proxies test_drawing_process test_packages"
+    " test_preferences test_uploads test_http_server test_learned_distance test_library test_overload"
+).split()
+"""Files of tests by how long they take, the longest first: begun in that order, all workers end together."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The tables come first: they take longest, and another process takes the rest meanwhile."""
-    items.sort(key=lambda item: "results" not in getattr(item, "fixturenames", ()))
+    """The longest files first; within a file the order stays."""
+    place = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Playwright's synchronous interface keeps a loop in this thread; who has no browser may run another."""
+    loop = asyncio._get_running_loop()
+    if "chromium" not in getattr(item, "fixturenames", ()):
+        asyncio._set_running_loop(None)
+    try:
+        return (yield)
+    finally:
+        asyncio._set_running_loop(loop)
 
 
 @pytest.fixture(scope="session")
