@@ -8,11 +8,10 @@ import time
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 from markupsafe import Markup
-from mjviser import ViserMujocoScene
 
 from onedemo.app.annotation.phases import NAMES, told
 from onedemo.app.annotation.scale import ANSWERS
@@ -23,6 +22,9 @@ from onedemo.app.templates import render
 from onedemo.errors import UserError
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
+
+if TYPE_CHECKING:
+    from mjviser import ViserMujocoScene
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""
@@ -162,6 +164,8 @@ class Watch:
     # The robot
 
     def _build_scene(self) -> None:
+        from mjviser import ViserMujocoScene  # 0.4 s, for who sees the robot
+
         # A model of its own, as the scene writes into it; without the floor, which is drawn calmer here.
         scene = ViserMujocoScene(self._client, drawn_model(self._live.model_path), num_envs=1)  # type: ignore[arg-type]
         scene.camera_tracking_enabled = False
