@@ -50,14 +50,31 @@
     return said.charAt(0).toUpperCase() + said.slice(1);
   };
 
-  // Which runs are compared: their names, in a field that Viser sends on and nobody sees; "," is none.
+  // Which runs are compared: their names, in a field that Viser sends on and nobody sees; "," is none. The
+  // address says the same (static/address.js).
+  const compareField = () => document.querySelector("div:has(> .od-runs) + div input");
   function compareOnly(runs) {
-    const field = document.querySelector("div:has(> .od-runs) + div input");
-    const value = runs.length === 1 && !runs[0] ? "," : runs.join(", ");
+    const none = runs.length === 1 && !runs[0];
+    address.compared = runs.length ? runs.join(",") : null;
+    const field = compareField();
     // React sees a change only through the element's own setter.
-    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, value);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, none ? "," : runs.join(", "));
     field.dispatchEvent(new Event("input", { bubbles: true }));
   }
+  // When the tab comes: what the address says, or else what was compared before is said in it.
+  let fieldBefore = null;
+  function compareAsAddressed() {
+    const field = compareField();
+    if (field === fieldBefore) return;
+    fieldBefore = field;
+    if (!field) return;
+    if (address.compared !== null) compareOnly(address.compared.split(","));
+    else if (field.value) address.compared = field.value.split(",").map((name) => name.trim()).filter(Boolean).join(",");
+  }
+  new MutationObserver(compareAsAddressed).observe(document.documentElement, { childList: true, subtree: true });
+  window.addEventListener("popstate", () => {
+    if (compareField() && address.compared !== null) compareOnly(address.compared.split(","));
+  });
   function compare(run) {
     const on = [...document.querySelectorAll('[data-compare][aria-pressed="true"]')].map((b) => b.dataset.compare);
     const runs = on.includes(run) ? on.filter((name) => name !== run) : [...on, run];

@@ -219,7 +219,8 @@ const page = (() => {
   }
 
   function sayWhy(box, reason) {
-    send({ press: "reason", clip: Number(box.dataset.clip), reason });
+    const { clip, pair } = box.dataset;
+    send(pair ? { press: "pair reason", pair: Number(pair), reason } : { press: "reason", clip: Number(clip), reason });
   }
 
   // Keys that concern this browser alone. True if the key was one of them.

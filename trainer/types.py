@@ -185,3 +185,8 @@ class Status:
     """Ratings asked for in all."""
     next_clips_s: float | None = None
     """Seconds until the iteration ends, and with it new clips are expected; None if not known."""
+
+    @property
+    def asked_ratings(self) -> int:
+        """Ratings that people are asked for so far, as ``RatingQueue.asked``."""
+        return self.target_ratings if self.iteration else self.pretrain_ratings

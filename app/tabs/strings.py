@@ -25,7 +25,7 @@ COMPARE_KEYS: Keys = (
     (("2",), "about the same"),
     (("3",), "the right one is closer to the video"),
     (("U",), "undo your last answer, and those before it (also Backspace)"),
-    (("S",), "skip these two"),
+    (("S",), "skip these two; you may say why"),
     *_PLAYING,
     *_HELP,
 )

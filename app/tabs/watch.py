@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ from onedemo.app.tabs import charts, progress
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.errors import UserError
+from onedemo.render.renderer import LIMB_COLOURS
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
 
@@ -35,7 +37,8 @@ _APART_SECONDS = 0.1
 _CAMERA_POSITION = (0.0, -3.0, 1.02)
 _CAMERA_TARGET = (0.0, 0.0, 1.02)
 _CAMERA_FOV = 45.0
-_LIMBS = ((0.91, 0.29, 0.17, 1.0), (0.13, 0.25, 0.47, 1.0), (0.20, 0.48, 0.76, 1.0), (0.97, 0.69, 0.15, 1.0))
+_DEEPER = 1.45
+"""Exponent of a limb's colour: the browser's tone mapping makes colours paler than they are in clips."""
 
 
 class Watch:
@@ -173,8 +176,8 @@ class Watch:
         shown = self._client.scene
         shown.configure_environment_map(None)
         shown.configure_default_lights(False)
-        shown.add_light_directional("/lights/key", intensity=3.0, position=(0.5, -1.5, 4.0), cast_shadow=True)
-        shown.add_light_directional("/lights/fill", intensity=1.5, position=(-1.5, -4.0, -1.0))
+        shown.add_light_directional("/lights/key", intensity=3.2, position=(0.5, -1.5, 4.0), cast_shadow=True)
+        shown.add_light_directional("/lights/fill", intensity=1.6, position=(-1.5, -4.0, -1.0))
         shown.add_grid(
             "/fixed_bodies/floor",
             infinite_grid=True,
@@ -257,5 +260,10 @@ def drawn_model(path: Path) -> mujoco.MjModel:
     model = spec.compile()
     for geom in range(model.ngeom):
         model.geom_matid[geom] = -1
-        model.geom_rgba[geom] = _LIMBS[min(geom, len(_LIMBS) - 1)]
+        model.geom_rgba[geom] = in_this_light(LIMB_COLOURS[geom % len(LIMB_COLOURS)])
     return model
+
+
+def in_this_light(colour: Sequence[float]) -> list[float]:
+    """A colour as it must be for the live view to look like a clip: RGB to RGBA, 0..1."""
+    return [*(part**_DEEPER for part in colour), 1.0]

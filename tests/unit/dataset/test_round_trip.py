@@ -85,6 +85,7 @@ def study(tmp_path_factory):
         say(pairs[0], ann, "left", 50)
         say(pairs[0], bob, "equal", 60)
         say(pairs[1], ann, "skip", 70)
+        say(pairs[1], ann, "skip", 0, reason="=too short")
         say(pairs[2], ann, "right", 80)
         say(pairs[2], ann, "undo", 0)
         say(pairs[2], ann, "left", 90)
@@ -98,7 +99,7 @@ def test_everything_comes_back(study, tmp_path, capsys):
     assert sorted(path.name for path in export.iterdir()) == sorted(FILES)
     again = tmp_path / "again"
     assert main(["import", str(export), "--data-dir", str(again)]) == 0
-    assert capsys.readouterr().out == "2 runs  6 clips  5 ratings  4 comparisons  22 events\n"
+    assert capsys.readouterr().out == "2 runs  6 clips  5 ratings  4 comparisons  23 events\n"
     with closing(Store(data_dir)) as before, closing(Store(again)) as after:
         for query in (EVENTS, ANSWERS):
             one, other = (by_name(store, query) for store in (before, after))

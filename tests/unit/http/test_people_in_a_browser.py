@@ -312,6 +312,41 @@ def test_a_link_that_opened_once_leads_back_to_the_page_it_opened(store):
     run(go())
 
 
+def test_the_button_may_be_pressed_again_if_its_answer_was_lost(store):
+    """Before, the link was used up and its owner stood outside."""
+    ann = store.accounts.ensure("ann", "annotator")
+
+    async def lost(door, one, link):
+        """Presses the button, and the answer never comes: the browser keeps no cookie of it."""
+        page = await one.get(link)
+        assert page.status == 200 and "works only once" in page.text
+        before = {cookie.key: cookie.value for cookie in one.session.cookie_jar}
+        assert await press_the_button(door, one, link[-43:]) == 303
+        for cookie in list(one.session.cookie_jar):
+            if before.get(cookie.key) != cookie.value:
+                one.session.cookie_jar.clear(lambda morsel, key=cookie.key: morsel.key == key)
+
+    async def go():
+        async with front(store) as door, browser(door) as one, browser(door) as another:
+            first, second = (passing_link(store, ann, door.url, once=True) for _ in range(2))
+            await lost(door, one, first)
+            assert (await one.get("/r/1/session")).status == 401
+            assert await press_the_button(door, one, first[-43:]) == 303
+            assert (await one.get("/r/1/session")).status == 204
+            await lost(door, one, second)  # and by the link itself
+            assert (await one.get(second, follow=True)).at == "/r/1/"
+            assert (await one.get("/r/1/session")).status == 204
+            # The number alone opens nothing, nor does the link in another browser, nor after signing out.
+            assert await press_the_button(door, another, first[-43:]) == 403
+            await another.get(passing_link(store, ann, door.url, once=True))
+            assert await press_the_button(door, another, first[-43:]) == 403
+            assert (await one.post("/r/1/signout")).status == 303
+            assert await press_the_button(door, one, second[-43:]) == 403
+
+    run(go())
+    assert sum(presence.browsers for presence in store.accounts.presence().values()) == 1
+
+
 async def press_the_button(door, one, token):
     """Opens a link that opens once; the status of the answer."""
     async with one.session.post(
