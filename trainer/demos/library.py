@@ -29,10 +29,10 @@ from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import hold, write_atomic
 from onedemo.core.names import check_name, check_new_name
 from onedemo.demos.containers import check_file
+from onedemo.demos.edits import Options, check_options
 from onedemo.demos.frame_clock import steps_of_frames
-from onedemo.demos.import_checks import check_options
 from onedemo.demos.preparing import ABOUT, VIDEO, demo_of, describe, origin_of, prepare_demo, sha256_of
-from onedemo.demos.sandboxed_decoder import Limits, Options
+from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.demos.video import VideoReader, jpeg, write_webm
 from onedemo.errors import UserError
 from onedemo.types import Demo
@@ -52,6 +52,12 @@ def import_video(
     crop: tuple[int, int, int, int] | None = None,
     mirror: bool = False,
     fps: float = 30.0,
+    speed: float = 1.0,
+    reverse: bool = False,
+    loop: int = 1,
+    rotate: int = 0,
+    track: bool = False,
+    stabilise: bool = False,
     task: str = "",
     source: str = "",
     limits: Limits | None = None,
@@ -70,6 +76,12 @@ def import_video(
         crop: (x, y, width, height) of the part to use, pixels of the upright source.
         mirror: Swap left and right.
         fps: Frame rate to bring it to, 1..120.
+        speed: How many times faster it is played, 0.1..20.
+        reverse: Play it backwards.
+        loop: How many times it is shown, end to end; 0: as often as fits into 8 s.
+        rotate: Degrees clockwise: 0, 90, 180 or 270.
+        track: Let a crop of fixed size follow what moves; of ``crop`` then only the size counts.
+        stabilise: Hold the background still.
         task: The hand-coded reward that describes the move, if known.
         source: Where the video is from; its file name if empty.
         limits: What decoding it may take; the defaults if None.
@@ -83,9 +95,12 @@ def import_video(
     """
     path, demos_dir = Path(path), Path(demos_dir)
     check_new_name(check_name(name))
-    check_options(start=start, end=end, crop=crop, fps=fps)
+    options = Options(
+        start=start, end=end, crop=crop, mirror=mirror, fps=fps, speed=speed, reverse=reverse, loop=loop,
+        rotate=rotate, track=track, stabilise=stabilise,
+    )  # fmt: skip
+    check_options(options)
     check_file(path)
-    options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)
     stored = list(_load_all(demos_dir))
     origin = origin_of(path, options)
     for demo, about in stored:
@@ -313,6 +328,7 @@ def show(demo: Demo) -> str:
         "size": f"{demo.width} x {demo.height} pixels",
         "task": demo.task or "not named",
         "source": demo.source or "not named",
+        "edits": demo.edits or "none",
         "file": str(demo.path),
         "sha256": demo.sha256,
     }

@@ -13,15 +13,15 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from onedemo.core.files import write_atomic
+from onedemo.demos.edits import Options, in_words
 from onedemo.demos.import_checks import StoredCheck
-from onedemo.demos.sandboxed_decoder import DECODING, Limits, Options, decode
+from onedemo.demos.sandboxed_decoder import DECODING, Limits, decode
 from onedemo.demos.video import VideoReader, write_webm
 from onedemo.types import Demo
 
@@ -81,8 +81,7 @@ def prepare_demo(
 
 def origin_of(path: Path, options: Options) -> dict[str, Any]:
     """What a demo was made of, and how: of the same, the frames are the same and need not be decoded."""
-    wanted = asdict(options) | {"crop": list(options.crop) if options.crop else None}
-    return {"source_sha256": sha256_of(path), "options": wanted, "decoding": DECODING}
+    return {"source_sha256": sha256_of(path), "options": options.told(), "decoding": DECODING}
 
 
 def describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
@@ -106,6 +105,7 @@ def demo_of(about: dict[str, Any], video: Path) -> Demo:
         height=int(about["height"]),
         task=str(about.get("task", "")),
         source=str(about.get("source", "")),
+        edits=in_words(about.get("options") or {}),
     )
 
 

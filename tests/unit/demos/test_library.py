@@ -68,8 +68,9 @@ def make_video(path, count=30, fps=30.0, size=(WIDTH, HEIGHT), picture=numbered)
 def quickly(request, monkeypatch):
     """Decodes in this process, but for tests that are marked ``seam``: the child has tests of its own."""
     if request.node.get_closest_marker("seam") is None:
-        in_this = lambda path, options, _, warn: in_process(path, options, warn)  # noqa: E731
-        monkeypatch.setattr(preparing, "decode", in_this)
+        monkeypatch.setattr(
+            preparing, "decode", lambda path, options, _, warn: in_process(path, options, warn)
+        )
 
 
 def in_process(path, options, warn):
