@@ -33,6 +33,8 @@ class Demo:
     """The hand-coded reward that describes the move ("backflip", "hop"), or "" where none is known."""
     source: str = ""
     """What the video was made from: a file name or a command."""
+    edits: str = ""
+    """What was done to that video on its way in, in a few words."""
 
     @property
     def seconds(self) -> float:

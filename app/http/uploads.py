@@ -29,7 +29,8 @@ from onedemo.core.directories import Workshop, clear_left_over, make_directory
 from onedemo.core.files import private_opener
 from onedemo.demos.containers import check_file
 from onedemo.demos.import_checks import check_options
-from onedemo.demos.library import demo_picture, keep_demo, known_demo, prepare_demo
+from onedemo.demos.library import demo_picture, keep_demo, known_demo
+from onedemo.demos.preparing import prepare_demo
 from onedemo.demos.sandboxed_decoder import Look, Options, look
 from onedemo.demos.video import jpeg
 from onedemo.errors import UserError

@@ -12,6 +12,8 @@ import numpy as np
 
 Turn = tuple[int, int, int, int]
 """A display matrix (a, b, c, d): x' = a x + c y, y' = b x + d y, each -1, 0 or 1."""
+TURNS: dict[int, Turn] = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+"""By degrees, clockwise."""
 
 
 def pixel_aspect(aspect: Fraction | None) -> float:
