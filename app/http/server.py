@@ -169,6 +169,9 @@ class Front:
             Route("GET", UPLOAD + "/poster.jpg", "researcher", uploads.poster),
             Route("POST", UPLOAD + "/result", "researcher", uploads.bring_in),
             Route("GET", UPLOAD + r"/result-{result:\d{1,6}}.webm", "researcher", uploads.result),
+            Route(
+                "GET", UPLOAD + r"/result-{result:\d{1,6}}-{end:first|last}.jpg", "researcher", uploads.still
+            ),
             Route("POST", UPLOAD + "/keep", "researcher", uploads.keep, "added a demo"),
             Route("POST", UPLOAD + "/discard", "researcher", uploads.discard),
         )
