@@ -1,21 +1,27 @@
 // The part of a video that is wanted: two handles on its time, a rectangle on its picture. For static/demos.js.
 //
-// Times are seconds, the crop is shares of the picture's width and height: x, y, w, h.
+// Times are seconds, the crop is shares of the turned picture's width and height: x, y, w, h; it is turned by
+// degrees, clockwise.
 //
-// part(name) gives an element of the dialog. hooks: size() gives the width and height of the upright video,
-// pixels; moved(which) is called when "start" or "end" has been moved.
+// part(name) gives an element of the dialog. hooks: upright() gives the width and height of the upright video,
+// pixels, before it is turned; moved(which) is called when "start" or "end" has been moved.
 function demoPart(part, hooks) {
   "use strict";
-  const { size, moved } = hooks;
+  const { upright, moved } = hooks;
   const FRAME = 1 / 30; // of what is stored, and a step of the arrow keys
   const LEAST = 0.3; // seconds of a demo
   const LEAST_SIDE = 16; // pixels
   const WHOLE = { x: 0, y: 0, w: 1, h: 1 };
   const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
-  let start, end, length, crop;
+  let start, end, length, crop, turned;
 
   function begin() {
-    [start, end, length, crop] = [0, 0, 0, { ...WHOLE }];
+    [start, end, length, crop, turned] = [0, 0, 0, { ...WHOLE }, 0];
+  }
+
+  function size() {
+    const [width, height] = upright();
+    return turned % 180 ? [height, width] : [width, height];
   }
 
   function measure(seconds) {
@@ -38,6 +44,12 @@ function demoPart(part, hooks) {
     const h = clamp(box.h, Math.min(1, LEAST_SIDE / height), 1);
     crop = { w, h, x: clamp(box.x, 0, 1 - w), y: clamp(box.y, 0, 1 - h) };
     draw();
+  }
+
+  // By a quarter, with the rectangle.
+  function turn() {
+    turned = (turned + 90) % 360;
+    setCrop({ x: 1 - crop.y - crop.h, y: crop.x, w: crop.h, h: crop.w });
   }
 
   const whole = () => crop.w > 0.999 && crop.h > 0.999;
@@ -65,6 +77,11 @@ function demoPart(part, hooks) {
     }
     part("lasts").textContent = length ? `${(end - start).toFixed(2)} s of ${length.toFixed(2)} s` : "";
     part("lasts").classList.toggle("od-bad", end - start > 60);
+    const [width, height] = size();
+    const frame = part("frame").style;
+    for (const [name, value] of Object.entries({ width, height, turn: `${turned}deg` })) frame.setProperty(`--od-${name}`, value);
+    part("frame").classList.toggle("od-across", turned % 180 !== 0);
+    part("turned").textContent = turned ? `Turned by ${turned} degrees, clockwise` : "";
     const box = part("crop");
     for (const [name, value] of Object.entries({ left: crop.x, top: crop.y, width: crop.w, height: crop.h }))
       box.style[name] = `${100 * value}%`;
@@ -178,11 +195,17 @@ function demoPart(part, hooks) {
   begin();
   listen();
   return {
-    begin, draw, measure, pixels, whole, setWhole: () => setCrop(WHOLE),
+    begin, draw, measure, turn,
+    setWhole: () => setCrop(WHOLE),
+    // As the server takes it.
+    chosen: () => ({
+      start: start || null,
+      end: length && end >= length - FRAME / 2 ? null : end || null,
+      rotate: turned,
+      crop: whole() ? null : pixels(),
+    }),
     get start() { return start; },
     get end() { return end; },
     get length() { return length; },
-    // Whether nothing is left out at the end.
-    get toTheEnd() { return Boolean(length) && end >= length - FRAME / 2; },
   };
 }

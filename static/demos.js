@@ -1,6 +1,7 @@
 // A new demonstration: a video is chosen, sent, trimmed and cropped, looked at as it would be learned from, and
 // kept. The dialog stands outside what Viser draws, so it outlives a lost connection; closing it keeps its state.
-// Which part of the video is wanted, and its handles: static/demo-part.js.
+// Which part of the video is wanted, and its handles: static/demo-part.js. How it is played, and what comes of it:
+// static/demo-result.js.
 const demos = (() => {
   "use strict";
   const { named } = page; // static/page.js
@@ -8,14 +9,15 @@ const demos = (() => {
 
   let dialog = null;
   const part = (name) => dialog.querySelector(`[data-part="${name}"]`);
-  let file, upload, sending, playable, wanted;
+  let file, upload, sending, playable, wanted, preview;
 
   function open() {
     if (!dialog) {
       const template = document.querySelector("#od-new-demo");
       dialog = template.content.firstElementChild.cloneNode(true);
       document.body.append(dialog);
-      wanted = demoPart(part, { size, moved });
+      wanted = demoPart(part, { upright, moved });
+      preview = demoResult(part, { bring, place });
       listen();
       begin();
     }
@@ -27,10 +29,9 @@ const demos = (() => {
     if (file) URL.revokeObjectURL(part("video").src);
     [file, upload, sending, playable] = [null, null, null, null];
     wanted.begin();
+    preview.begin();
     part("file").value = "";
     part("video").removeAttribute("src");
-    part("result").removeAttribute("src");
-    part("mirror").checked = false;
     show("choose");
   }
 
@@ -42,7 +43,7 @@ const demos = (() => {
   }
 
   const say = (text, bad = false) => {
-    for (const note of dialog.querySelectorAll(".od-form-note")) {
+    for (const note of dialog.querySelectorAll(":is([data-step=choose], [data-step=part]) > .od-form-note")) {
       note.textContent = text;
       note.classList.toggle("od-bad", bad);
     }
@@ -130,7 +131,7 @@ const demos = (() => {
 
   // ---- 2: which part
 
-  function size() {
+  function upright() {
     const video = part("video");
     return upload ? [upload.width, upload.height] : [video.videoWidth || 1, video.videoHeight || 1];
   }
@@ -166,7 +167,7 @@ const demos = (() => {
         drop.classList.toggle("od-over", name === "dragover");
         if (name === "drop" && event.dataTransfer.files[0]) choose(event.dataTransfer.files[0]);
       });
-    const press = { close: () => dialog.close(), again: () => (discard(), begin()), whole: wanted.setWhole, back: () => show("part"),
+    const press = { close: () => dialog.close(), again: () => (discard(), begin()), whole: wanted.setWhole, turn: wanted.turn, back: () => show("part"),
       play: () => (video.paused ? (video.currentTime = wanted.start, video.play()) : video.pause()), show: result, run: () => startRun(part("run").dataset.name) };
     for (const [name, act] of Object.entries(press))
       for (const button of dialog.querySelectorAll(`[data-press="${name}"]`)) button.addEventListener("click", act);
@@ -179,46 +180,34 @@ const demos = (() => {
     const answer = await line.request(`demos/${upload.upload}/${where}`, {
       method: "POST", signal: null, headers: { "Content-Type": "application/json", ...named() },
       body: JSON.stringify(body ?? {}),
+    }).catch((error) => {
+      throw line.unanswered(error) ? new Error("The server does not answer. Nothing is lost: please try again.") : error;
     });
     if (!answer.ok) throw new Error(await answer.text());
     return answer;
+  }
+
+  const place = () => `demos/${upload.upload}`;
+
+  // What the server makes of the part with these options.
+  async function bring(options) {
+    const of = upload;
+    const facts = await (await line.during(post("result", { ...wanted.chosen(), ...options }))).json();
+    if (of !== upload) throw new Error("Another video was chosen.");
+    return facts;
   }
 
   async function result() {
     const of = upload;
     part("show").disabled = true;
     say("The part is being brought in: some seconds.");
-    const body = {
-      start: wanted.start || null,
-      end: wanted.toTheEnd ? null : wanted.end || null,
-      crop: wanted.whole() ? null : wanted.pixels(),
-      mirror: part("mirror").checked,
-    };
     try {
-      const facts = await (await line.during(post("result", body))).json();
-      if (of !== upload) return;
+      await preview.show();
       say("");
-      part("result").src = `demos/${of.upload}/result-${facts.result}.webm`;
-      part("facts").replaceChildren(
-        ...[["Length", `${facts.seconds.toFixed(2)} s`], ["Frames", `${facts.frames}`], ["Rate", `${facts.fps} a second`],
-          ["Size", `${facts.width} x ${facts.height} pixels`]].map(([term, value]) => {
-          const pair = document.createElement("div");
-          const [dt, dd] = [document.createElement("dt"), document.createElement("dd")];
-          [dt.textContent, dd.textContent] = [term, value];
-          pair.append(dt, dd);
-          return pair;
-        }),
-      );
-      const told = [...facts.warnings];
-      if (facts.known) told.unshift(`This video is a demo already, called ${facts.known}. Keeping it adds nothing.`);
-      part("warnings").replaceChildren(
-        ...told.map((text) => Object.assign(document.createElement("li"), { textContent: text })),
-      );
       show("result");
-      part("result").play().catch(() => {});
-      part("name").focus();
+      part("result").focus();
     } catch (error) {
-      say(error.message, true);
+      if (of === upload) say(error.message, true);
     } finally {
       part("show").disabled = !upload;
     }

@@ -172,6 +172,9 @@ class Front:
             Route("POST", UPLOAD + "/result", "researcher", uploads.bring_in),
             Route("GET", UPLOAD + r"/result-{result:\d{1,6}}.webm", "researcher", uploads.result),
             Route("POST", UPLOAD + "/mask", "researcher", MaskPreview(uploads).find),
+            Route(
+                "GET", UPLOAD + r"/result-{result:\d{1,6}}-{end:first|last}.jpg", "researcher", uploads.still
+            ),
             Route("POST", UPLOAD + "/keep", "researcher", uploads.keep, "added a demo"),
             Route("POST", UPLOAD + "/discard", "researcher", uploads.discard),
         )

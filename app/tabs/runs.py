@@ -20,6 +20,7 @@ from onedemo.app.tabs import charts
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.config import METHODS, RunConfig, describe
+from onedemo.demos.edits import USEFUL_SECONDS
 from onedemo.demos.library import list_demos
 from onedemo.queries.settings import CHOICES
 from onedemo.storage.rating_counts import Counts
@@ -72,7 +73,7 @@ class Runs:
         self._demos = gui.add_html("")
         dialogs = (
             render("runs.html:edit_run"), render("runs.html:edit_demo"),
-            render("runs.html:new_demo", megabytes=LARGEST >> 20),
+            render("runs.html:new_demo", megabytes=LARGEST >> 20, useful=USEFUL_SECONDS),
         )  # fmt: skip
         gui.add_html(f'<div class="od-dialogs">{"".join(map(str, dialogs))}</div>')
 

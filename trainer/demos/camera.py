@@ -157,15 +157,15 @@ class Survey:
         """Left, top, right and bottom of what moves, (m, 4), in the pictures of these numbers, (m,)."""
         from onedemo.render.mover import locate  # with it comes MuJoCo, for the studio's measures
 
-        width, height = self._size
+        shape = self._small[0][1].shape
+        by = np.array([shape[1] / self._size[0], shape[0] / self._size[1]])
+        left, top = (math.ceil(place) for place in room[:2] * by)
+        right, bottom = (int(place) for place in np.add(room[:2], room[2:]) * by)
         pictures = []
         for number, small in self._small:
-            by = small.shape[1] / width, small.shape[0] / height
             if poses is not None:
-                moved = _resized(_matrix(*poses[number]), (height, width), small.shape)
-                small = cv2.warpAffine(small, moved[:2], small.shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
-            left, top = math.ceil(room[0] * by[0]), math.ceil(room[1] * by[1])
-            right, bottom = int((room[0] + room[2]) * by[0]), int((room[1] + room[3]) * by[1])
+                moved = _resized(_matrix(*poses[number]), self._size[::-1], shape)
+                small = cv2.warpAffine(small, moved[:2], shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
             pictures.append(small[top:bottom, left:right])
         self._small, numbers = [], np.array([number for number, _ in self._small])
         mover = locate(np.stack(pictures))
@@ -175,7 +175,7 @@ class Survey:
                 f"--track finds nothing in {self._name} that moves before a background that stands still; "
                 f"{others}choose another part with --start and --end, or use --crop alone"
             )
-        return (mover.box + np.array([left, top, left, top])) / [*by, *by], numbers
+        return (mover.box + np.array([left, top, left, top])) / np.tile(by, 2), numbers
 
 
 class _Background:
@@ -226,7 +226,7 @@ class _Background:
         back, again, _ = cv2.calcOpticalFlowPyrLK(
             grey, self._first, there, self._points.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
         )
-        sure = (seen & again)[:, 0].astype(bool) & (np.abs(back - self._points).max(axis=(1, 2)) < 1)
+        sure = np.logical_and(seen, again)[:, 0] & (np.abs(back - self._points).max(axis=(1, 2)) < 1)
         now, before = there[sure, 0], self._points[sure, 0]
         if len(now) < _FEWEST_POINTS:
             return None, 0.0

@@ -38,6 +38,7 @@ def prepare_demo(
     source: str,
     limits: Limits | None = None,
     warn: Callable[[str], object] = lambda _: None,
+    stored: Callable[[np.ndarray], object] = lambda _: None,
 ) -> Demo:
     """Brings a video in as a demo that is not kept yet, nor named: its files are in ``place`` afterwards.
 
@@ -49,6 +50,7 @@ def prepare_demo(
         source: Where the video is from.
         limits: What decoding it may take; the defaults if None.
         warn: Called with each sentence about what is not as it should be, though usable.
+        stored: Called with each frame as it was stored, (H, W, 3), in order.
 
     Returns:
         The demo, without a name.
@@ -64,6 +66,7 @@ def prepare_demo(
     with VideoReader(video) as reader:
         for frame in reader.frames():
             check.stored(frame)
+            stored(frame)
     about = describe(
         place / ABOUT,
         video,

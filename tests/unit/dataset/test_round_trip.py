@@ -389,7 +389,8 @@ def test_a_full_disk_is_a_sentence_and_leaves_no_half_file(study, tmp_path, opti
 @pytest.mark.seam
 def test_a_demo_of_that_name_with_other_frames_is_named_before_anything_is_imported(tmp_path, capsys):
     there, here = tmp_path / "there", tmp_path / "here"
-    rated = import_video(make_video(tmp_path / "a.avi", count=20), name="kick", demos_dir=there / "demos")
+    video = make_video(tmp_path / "a.avi", count=40)
+    rated = import_video(video, name="kick", demos_dir=there / "demos", speed=2.0, reverse=True)
     import_video(make_video(tmp_path / "b.avi", count=15), name="kick", demos_dir=here / "demos")
     config = to_toml(load_config(None, {}))
     with closing(Store(there)) as store:
@@ -398,7 +399,10 @@ def test_a_demo_of_that_name_with_other_frames_is_named_before_anything_is_impor
     assert main(["export", "--data-dir", str(there), "--all", str(tmp_path / "all")]) == 0
     assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 2
     said = capsys.readouterr().err
-    assert "run r-1 was rated beside a demo kick of 20 frames" in said and "has 15 and other pictures" in said
+    assert "rated beside a demo kick of 20 frames (2 times as fast, backwards), and the one" in said
+    assert "has 15 and other pictures" in said
+    card_text = (tmp_path / "all" / "card.md").read_text()
+    assert "What was done to the video of the demonstration: 2 times as fast, backwards." in card_text
     assert not (here / "runs").exists()
     assert main(["demo", "rename", "kick", "kick-other", "--data-dir", str(here)]) == 0
     assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 0
