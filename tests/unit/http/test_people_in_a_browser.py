@@ -538,7 +538,7 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
         async with front(store) as door, browser(door) as one:
             await one.get(link_of(store, door.url, "ada", "researcher"))
             paths = [route.path for route in door.routes() if route.method == "POST"]
-            assert len(paths) == 12
+            assert len(paths) == 14
             for path in paths:
                 path = path.replace(r"{rater:\d{1,9}}", "1").replace("{upload:[0-9a-f]{32}}", "a" * 32)
                 refused = [
