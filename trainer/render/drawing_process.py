@@ -22,7 +22,8 @@ from typing import Any, TypeVar
 
 from onedemo.core.process import prepare_process
 from onedemo.errors import in_words
-from onedemo.render.renderer import Order, Renderer, RenderThread
+from onedemo.render.render_thread import Order, RenderThread
+from onedemo.render.renderer import Renderer
 
 log = logging.getLogger("onedemo")
 

@@ -27,7 +27,8 @@ from onedemo.demos.video import write_webm
 from onedemo.render.clip_image import compose_clip, side_by_side
 from onedemo.render.framing import clip_sides
 from onedemo.render.mover import Mover, locate
-from onedemo.render.renderer import Drawing, Order, Renderer
+from onedemo.render.render_thread import Drawing, Order
+from onedemo.render.renderer import Renderer
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.types import Demo, Segment

@@ -22,7 +22,7 @@ import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
-from onedemo.render.renderer import Drawing
+from onedemo.render.render_thread import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
 from onedemo.reward.warm_start import keep_start

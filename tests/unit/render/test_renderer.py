@@ -16,7 +16,8 @@ from helpers.paths import ROOT
 from onedemo.demos.frame_clock import frame_of_step, steps_of_frames
 from onedemo.render import renderer as renderer_module
 from onedemo.render.backdrop import CHECK_DARK, CHECK_LIGHT, LANE, SKY_HORIZON, SKY_TOP, Camera, backdrop
-from onedemo.render.renderer import HEIGHT, WIDTH, Renderer, RenderThread
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
 
@@ -292,7 +293,8 @@ from onedemo.core.process import prepare_process
 prepare_process()
 import onedemo.sim.vector_env, mujoco
 from onedemo.errors import UserError
-from onedemo.render.renderer import Renderer, RenderThread
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import Renderer
 mujoco.MjModel.from_xml_string("<mujoco/>")
 for make in (Renderer, RenderThread):
     try:
@@ -360,7 +362,8 @@ def test_software_draws_the_same_where_egl_does_not_work(tmp_path):
         pytest.skip("there is no OSMesa: install the package libosmesa6")
     code = (
         "import sys, numpy as np\nfrom onedemo.core.process import prepare_process\nprepare_process()\n"
-        "from onedemo.render.renderer import Renderer, RenderThread\n"
+        "from onedemo.render.render_thread import RenderThread\n"
+        "from onedemo.render.renderer import Renderer\n"
         "qpos = np.array([[0, 1.25, 0, 0, 0, 0.0]])\n"
         "with Renderer() as own, RenderThread() as other:\n"  # two contexts, of two threads
         "    pictures = [own.render(qpos), other.render(qpos).result(), own.render(qpos)]\n"

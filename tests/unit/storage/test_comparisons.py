@@ -16,7 +16,8 @@ from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.errors import UserError
 from onedemo.render.clip_image import read_about
-from onedemo.render.renderer import CloseUp, RenderThread
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import CloseUp
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store

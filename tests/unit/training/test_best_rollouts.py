@@ -6,7 +6,7 @@ import pytest
 from helpers.small_world import falling_demo, falling_states
 from onedemo.app.tabs.progress import timeline_html
 from onedemo.demos.video import VideoReader, count_frames
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.rl.rollouts import Transitions
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery
 from onedemo.training.pictures import PictureFiles, captioned

@@ -15,7 +15,8 @@ from helpers.small_world import falling_demo, small_config
 from onedemo.app.cli.main import main
 from onedemo.core.files import jpeg_fault, replacing
 from onedemo.demos.library import find_demo
-from onedemo.render.renderer import Order, Renderer, RenderThread
+from onedemo.render.render_thread import Order, RenderThread
+from onedemo.render.renderer import Renderer
 from onedemo.storage.clips import NewClip
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
