@@ -1,4 +1,4 @@
-"""One renderer in a thread of its own, for callers in any thread: what is most urgent is drawn first."""
+"""Renderers in a thread of its own, for callers in any thread: what is most urgent is drawn first."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ import numpy as np
 from onedemo.core.cpu import give_way
 from onedemo.errors import UserError
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot
 
 log = logging.getLogger("onedemo")
 
@@ -39,17 +41,20 @@ class Order(IntEnum):
 class Drawing(Protocol):
     """Whatever draws: a ``RenderThread``, or a process of its own."""
 
-    def submit(self, job: Callable[[Renderer], T], order: Order = ...) -> Future[T]:
+    def submit(
+        self, job: Callable[[Renderer], T], order: Order = ..., robot: Robot | None = ...
+    ) -> Future[T]:
         """As ``RenderThread.submit``."""
         ...
 
 
 class RenderThread:
-    """One renderer in a daemon thread of its own, for callers in any thread.
+    """A renderer for each robot, of the last few, in one daemon thread; for callers in any thread.
 
     Args:
         width: Pixels, even.
         height: Pixels, even.
+        robot: Whose positions are drawn where a job does not say; the hopper's if None.
         at_once: Whether to raise if this machine cannot draw; otherwise each job does, until one can.
         exact: As of ``Renderer``.
 
@@ -58,16 +63,18 @@ class RenderThread:
     """
 
     def __init__(
-        self, width: int = WIDTH, height: int = HEIGHT, *, at_once: bool = True, exact: bool = True
-    ) -> None:
+        self, width: int = WIDTH, height: int = HEIGHT, *, robot: Robot | None = None, at_once: bool = True,
+        exact: bool = True,
+    ) -> None:  # fmt: skip
+        self._robot = robot or robot_named(DEFAULT)
         self._make = partial(Renderer, width, height, exact=exact)
         self._jobs: queue.PriorityQueue[_Entry] = queue.PriorityQueue()
         self._numbers = itertools.count()
         self._lock = threading.Lock()
         self._closed = False
-        self._renderer: Renderer | None = None
+        self._renderers: dict[Robot, Renderer] = {}  # the last one used is the last one here
         started: Future[None] = Future()
-        self._put(Order.AWAITED, started, lambda _: None)
+        self._put(Order.AWAITED, started, lambda _: None, self._robot)
         self._thread = threading.Thread(target=self._work, name="render", daemon=True)
         self._thread.start()
         try:
@@ -78,12 +85,15 @@ class RenderThread:
                 raise
             log.error("%s", error)
 
-    def submit(self, job: Callable[[Renderer], T], order: Order = Order.AHEAD) -> Future[T]:
+    def submit(
+        self, job: Callable[[Renderer], T], order: Order = Order.AHEAD, robot: Robot | None = None
+    ) -> Future[T]:
         """Runs ``job(renderer)`` in the render thread; of equal order in the order of submission.
 
         Args:
-            job: Called with the thread's renderer.
+            job: Called with the robot's renderer.
             order: What it comes before, or after.
+            robot: Whose positions it draws; those of the thread's robot if None.
 
         Returns:
             The future of what ``job`` returns or raises.
@@ -95,7 +105,7 @@ class RenderThread:
         with self._lock:
             if self._closed:
                 raise RuntimeError("the render thread is closed")
-            self._put(order, future, job)
+            self._put(order, future, job, robot or self._robot)
         return future
 
     def render(self, qpos_Tq: np.ndarray) -> Future[np.ndarray]:
@@ -107,7 +117,7 @@ class RenderThread:
         with self._lock:
             if not self._closed:
                 self._closed = True
-                self._put(_LAST, Future(), lambda _: None)
+                self._put(_LAST, Future(), lambda _: None, self._robot)
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -117,8 +127,8 @@ class RenderThread:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _put(self, order: int, future: Future[Any], job: Callable[[Renderer], Any]) -> None:
-        self._jobs.put(_Entry(order, next(self._numbers), future, job))
+    def _put(self, order: int, future: Future[Any], job: Callable[[Renderer], Any], robot: Robot) -> None:
+        self._jobs.put(_Entry(order, next(self._numbers), future, job, robot))
 
     def _work(self) -> None:
         give_way(_NICE)  # before the driver starts threads of its own
@@ -126,8 +136,8 @@ class RenderThread:
             while (entry := self._jobs.get()).order < _LAST:
                 self._do(entry)
         finally:
-            if self._renderer is not None:
-                self._renderer.close()
+            for renderer in self._renderers.values():
+                renderer.close()
 
     def _do(self, entry: _Entry) -> None:
         if self._closed:
@@ -135,12 +145,20 @@ class RenderThread:
         if not entry.future.set_running_or_notify_cancel():
             return
         try:
-            if self._renderer is None:
-                self._renderer = self._make()
-                self._renderer.between = self._between
-            entry.future.set_result(entry.job(self._renderer))
+            entry.future.set_result(entry.job(self._of(entry.robot)))
         except BaseException as error:
             entry.future.set_exception(error)
+
+    def _of(self, robot: Robot) -> Renderer:
+        """The robot's renderer; of those of other robots the one that was used longest ago makes room."""
+        renderer = self._renderers.pop(robot, None)
+        if renderer is None:
+            renderer = self._make(robot=robot)
+            renderer.between = self._between
+            while len(self._renderers) >= _KEPT:
+                self._renderers.pop(next(iter(self._renderers))).close()
+        self._renderers[robot] = renderer
+        return renderer
 
     def _between(self) -> None:
         """Does what is more urgent than the film in hand; for a second at most, so that it ends some day."""
@@ -159,6 +177,8 @@ class RenderThread:
 
 
 _LAST = max(Order) + 1
+_KEPT = 2
+"""Robots that are drawn: that of the run, and of a run that was served before; a context takes 30 MB."""
 _PATIENCE_S = 1.0
 _NICE = 5
 """Behind the page, before practice: people wait for pictures."""
@@ -170,3 +190,4 @@ class _Entry:
     number: int
     future: Future[Any] = field(compare=False)
     job: Callable[[Renderer], Any] = field(compare=False)
+    robot: Robot = field(compare=False)
