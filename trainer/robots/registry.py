@@ -19,6 +19,10 @@ BUILT_IN = {
 """Robots that come with the program; each is read from its model when it is first asked for."""
 
 
+DEFAULT = "hopper"
+"""The robot where none is named."""
+
+
 @lru_cache(maxsize=64)
 def robot_named(name: str) -> Robot:
     """The robot of that name.

@@ -14,6 +14,8 @@ import gymnasium
 import mujoco
 import numpy as np
 
+from onedemo.robots.camera import Camera, chosen_camera
+
 GYMNASIUM_ASSETS = Path(str(gymnasium.__file__)).parent / "envs/mujoco/assets"
 
 CONTACT_MARGIN = 0.002
@@ -22,22 +24,6 @@ ground at rest without reaching it. Both geoms have a margin of 0.001 (hopper.xm
 them up."""
 
 Root = Literal["planar", "free", "fixed"]
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Camera:
-    """From where the robot is seen, and what of its place the camera follows."""
-
-    right: int = 0
-    """World axis (0, 1, 2 for x, y, z) that points to the right in pictures."""
-    up: int = 2
-    """World axis that points up in pictures."""
-    distance: float = 3.0
-    """Metres from the robot."""
-    height: float = 0.88
-    """Of the camera above the floor, metres."""
-    follows: bool = True
-    """Whether it follows the robot along ``right``; else it stands."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,7 +99,7 @@ class Robot:
     """Control steps in an episode unless asked otherwise."""
     velocity_limit: float = np.inf
     """Observed velocities are clipped to +- this, m/s and rad/s."""
-    camera: Camera = Camera()
+    camera: Camera
     start: Start = Start()
     wild: Wild
     stock: StockReward = StockReward()
@@ -224,6 +210,8 @@ def build(name: str, xml: Path, *, frame_skip: int, **known: object) -> Robot:
         "limbs": limbs, "feet": (), "wild": Wild(heights=(0.05, 2.0)),
         "stock": StockReward(forward=0.0 if root == "fixed" else 1.0),
     }  # fmt: skip
+    if "camera" not in known:
+        fields["camera"] = chosen_camera(model, root)
     return Robot(name=name, xml=xml, frame_skip=frame_skip, **(fields | known))  # type: ignore[arg-type]
 
 
