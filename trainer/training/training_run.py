@@ -42,7 +42,7 @@ from onedemo.training.pictures import PictureFiles, tidy
 from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Clip, Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
-from onedemo.vision.pose_estimator import PoseEstimator, Track
+from onedemo.vision.pose_estimator import PoseEstimator, Track, shipped_track
 from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 _TIDY_S = 10.0
@@ -180,6 +180,8 @@ class TrainingRun:
         features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
         if not self.config.predictor.appearance:
             return features, None
+        if (track := shipped_track(self.demo)) is not None:
+            return features, track
         began = time.monotonic()
 
         def note(share: float = 0.0) -> None:  # never called if it was learned before
