@@ -10,9 +10,7 @@ Shapes: n pictures, F demo frames, D frame features, P = 9 numbers of a pose (``
 
 from __future__ import annotations
 
-import hashlib
 import io
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +21,11 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
-from onedemo.core.names import check_name
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
-from onedemo.sim import kinematics, vector_env
+from onedemo.sim import kinematics
 from onedemo.types import Demo
+from onedemo.vision import learned_robots
 from onedemo.vision.encoders import Encoder
 
 _SEED = 20_000
@@ -46,7 +44,6 @@ _AROUND = 2
 """Frames before and after over which a speed is taken."""
 _STRANGE = 10.0
 """Videos of the robot have 1.0 to 1.1, a video of a person thousands."""
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -146,7 +143,7 @@ def learn(
     Args:
         env_name: The robot.
         encoder: Looks at the pictures.
-        cache_dir: Where it is kept, by robot and encoder.
+        cache_dir: Where it is kept, by robot and encoder; what comes with the program is not kept again.
         check: Called every now and then with the share that is done; what it raises ends the learning.
         count: Pictures to learn from, where it is not known yet.
         epochs: Passes over them.
@@ -154,16 +151,11 @@ def learn(
     Raises:
         UserError: If this machine cannot draw.
     """
-    spec = vector_env.spec(env_name)
-    model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
-    path = cache_dir / f"{check_name(env_name)}-{model}-{encoder.name}-v{_VERSION}.npz"
-    if (data := read_whole(path)) is not None:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            return PoseEstimator(stored)
+    name = f"{learned_robots.model_name(env_name)}-{encoder.name}-v{_VERSION}"
+    if (known := learned_robots.find(name, cache_dir)) is not None:
+        return PoseEstimator(known)
     appearance = regress(*pictures(env_name, encoder, count, check), check, epochs=epochs)
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **appearance.tensors)
-    write_atomic(path, buffer.getvalue())
+    learned_robots.keep(name, cache_dir, appearance.tensors)
     return appearance
 
 

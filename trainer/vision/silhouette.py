@@ -1,0 +1,312 @@
+"""The pose of a robot from its silhouette, learned from masks that are drawn of its own model.
+
+A small convolutional net looks at the shape in each frame, and convolutions along time put frames side by
+side, so that rates and travel are read, too, and what one frame hides the next one shows. Nothing depends on
+colours, lights or the floor: what masks are found in any video will do. It sees no demo and no rating, is
+learned once for a robot's model, and kept.
+
+Shapes: F frames, S x S pixels, K numbers of a place, P numbers of a pose, A = 2 P + 2 numbers that are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from onedemo.vision import learned_robots
+from onedemo.vision.masks import Masks
+from onedemo.vision.pose_estimator import Track
+from onedemo.vision.silhouette_pictures import Films, films
+from onedemo.vision.silhouette_views import PLACES, RATE, SIDE, Views, views
+
+VERSION = 1
+"""Raise it when what is drawn or how it is learned changes."""
+MEMBERS = 2
+_SEED = 30_000
+_FILMS = 2000
+_EPOCHS = 12
+_BATCH = 12
+"""Films at a time."""
+_RATE = 2e-3
+_DRAWING = 0.25
+"""Share of the time that drawing takes, as measured."""
+_WIDTH = 96
+_HELD_OUT = 0.1
+_ANOTHER = 0.6
+"""Doubt of half of the frames of a video from which on it shows another body."""
+_COARSE = 4
+"""Pixels along a side of the parts whose covered share is compared with that of the pose that was read."""
+
+
+class Silhouette:
+    """Reads pose, motion, travel and contact from silhouettes: a few small networks, averaged.
+
+    Args:
+        tensors: Their weights, and how right they were, as ``learn`` gives them.
+    """
+
+    def __init__(self, tensors: Mapping[str, np.ndarray]) -> None:
+        self.tensors = dict(tensors)
+        self.reach = float(tensors["reach"])
+        """Length of the robot stretched out, metres."""
+        self.held_out = np.asarray(tensors["held_out"], np.float64)
+        """Explained share of the variance of each number on films held out, (A,)."""
+        self._doubts = np.asarray(tensors["doubts"], np.float64)
+        self._nets = [_Net(len(self.held_out)) for _ in range(MEMBERS)]
+        for member, net in enumerate(self._nets):
+            names = net.state_dict()
+            weights = {n: torch.from_numpy(np.asarray(tensors[f"{member}.{n}"], np.float32)) for n in names}
+            net.load_state_dict(weights)
+            net.eval().requires_grad_(False)
+
+    def read(self, seen: Views) -> tuple[np.ndarray, np.ndarray]:
+        """What silhouettes show.
+
+        Args:
+            seen: Of frames that follow each other, ``RATE`` a second.
+
+        Returns:
+            The numbers, (F, A), and the doubt, (F,): 0 is sure, 1 may be any.
+        """
+        each, signs = self._signs(seen)
+        return each.mean(axis=0), np.sqrt(np.clip(signs @ self._doubts, 0, 1))
+
+    def _signs(self, seen: Views) -> tuple[np.ndarray, np.ndarray]:
+        """What each net reads, (M, F, A), and signs that it is wrong, (F, 4).
+
+        An unsure mean of directions lies inside the circle; nets differ where they have not learned; and the
+        robot in the pose that was read would cover other pixels.
+        """
+        with _one_thread():
+            each = np.stack([net.along(seen) for net in self._nets])
+            pose = each[..., : self._pose].mean(axis=0)
+            drawn = np.mean([net.drawn(pose) for net in self._nets], axis=0)
+        waves = pose[:, 1:].reshape(len(pose), -1, 2)
+        short = np.maximum(1 - np.square(waves).sum(axis=-1), 0).mean(axis=-1)
+        spread = each[..., : self._pose].var(axis=0).sum(axis=-1)
+        covered = _coarse(torch.from_numpy(seen.crops)).numpy()
+        unlike = np.square(drawn - covered).sum(axis=-1) / (np.square(covered).sum(axis=-1) + 1e-3)
+        return each, np.stack([np.ones_like(short), short, spread, np.minimum(unlike, 4)], axis=-1)
+
+    def numbers(self, found: Masks, fps: float) -> tuple[np.ndarray, np.ndarray]:
+        """What is read of the frames of a video.
+
+        Args:
+            found: Where the robot is, at the scale of this robot.
+            fps: Frames a second.
+
+        Returns:
+            As ``read``: frames in which nothing was found have a doubt of 1.
+        """
+        times = np.arange(len(found.masks)) / fps
+        looked = np.arange(0, times[-1] + 0.5 / RATE, 1 / RATE)
+        nearest = np.abs(looked[:, None] - times).argmin(axis=1)
+        seen = views(
+            found.masks, floor=found.floor, scale=found.scale, way=found.way, reach=self.reach, fps=fps
+        )
+        numbers, doubt = self.read(Views(crops=seen.crops[nearest], places=seen.places[nearest]))
+        at = np.stack([np.interp(times, looked, column) for column in numbers.T], axis=1)
+        doubt = np.maximum(np.interp(times, looked, doubt), found.doubt)
+        return at, np.where(seen.places[:, 5] > 0, doubt, 1.0)
+
+    def track(self, found: Masks, fps: float) -> Track:
+        """Pose, motion, travel and contact in the frames of a video; arguments as of ``numbers``."""
+        at, doubt = self.numbers(found, fps)
+        pose, motion = at[:, : self._pose], at[:, self._pose : 2 * self._pose]
+        waves = pose[:, 1:].reshape(len(pose), -1, 2)
+        waves = waves / np.maximum(np.linalg.norm(waves, axis=-1, keepdims=True), 1e-6)
+        pose = np.concatenate([pose[:, :1], waves.reshape(len(pose), -1)], axis=1)
+        return Track(
+            pose=pose.astype(np.float32), motion=motion.astype(np.float32), doubt=doubt.astype(np.float32)
+        )
+
+    def known_track(self, found: Masks, fps: float) -> Track | None:
+        """The track of a video of this robot; None of one that shows another body, by its doubt."""
+        track = self.track(found, fps)
+        assert track.doubt is not None
+        return track if np.median(track.doubt) < _ANOTHER else None
+
+    @property
+    def _pose(self) -> int:
+        return (len(self.held_out) - 2) // 2
+
+
+def file_name(env_name: str) -> str:
+    """Names the file of what is learned of a robot."""
+    return f"{learned_robots.model_name(env_name)}-silhouette-v{VERSION}"
+
+
+def learn(
+    env_name: str, cache_dir: Path, check: Callable[[float], None] = lambda _: None, *,
+    count: int = _FILMS, epochs: int = _EPOCHS, shipped: bool = True,
+) -> Silhouette:  # fmt: skip
+    """Learns what the robot's silhouettes show, or takes what was learned before.
+
+    Args:
+        env_name: The robot.
+        cache_dir: Where it is kept, by the robot's model.
+        check: Called now and then with the share that is done; what it raises ends the learning.
+        count: Films to learn from, where it is not known yet.
+        epochs: Passes over them.
+        shipped: Whether what comes with the program will do.
+
+    Raises:
+        UserError: If this machine cannot draw.
+    """
+    name = file_name(env_name)
+    if (known := learned_robots.find(name, cache_dir, shipped=shipped)) is not None:
+        return Silhouette(known)
+
+    def drawn(share: float) -> None:
+        check(_DRAWING * share)
+
+    def fitted(share: float) -> None:
+        check(_DRAWING + (1 - _DRAWING) * share)
+
+    learned = fit(films(env_name, count, _SEED, drawn), fitted, epochs=epochs)
+    learned_robots.keep(name, cache_dir, learned.tensors)
+    return learned
+
+
+def fit(
+    shown: Films, check: Callable[[float], None] = lambda _: None, *, epochs: int = _EPOCHS
+) -> Silhouette:
+    """Fits the networks; the last tenth of the films is held out and judges them, and their doubt.
+
+    One thread computes, so that the same films give the same networks on any machine of a kind.
+
+    Args:
+        shown: What is learned from.
+        check: Called before each pass over them with the share that is done; what it raises ends the fit.
+        epochs: Passes over them.
+    """
+    with _one_thread():
+        return _fit(shown, check, epochs)
+
+
+def _fit(shown: Films, check: Callable[[float], None], epochs: int) -> Silhouette:
+    generator = torch.Generator().manual_seed(_SEED)
+    count, _, size = shown.aims.shape
+    train = count - max(1, round(_HELD_OUT * count))
+    crops, places, aims = (torch.from_numpy(x) for x in (shown.crops, shown.places, shown.aims))
+    tensors: dict[str, np.ndarray] = {
+        "reach": np.array(shown.reach), "held_out": np.zeros(size), "doubts": np.zeros(4),
+    }  # fmt: skip
+    updates = epochs * -(-train // _BATCH)
+    for member in range(MEMBERS):
+        net = _Net(size)
+        net.draw_weights(generator)
+        optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=2e-2, fused=True)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
+        for epoch in range(epochs):
+            check((member + epoch / epochs) / MEMBERS)
+            for index in torch.randperm(train, generator=generator).split(_BATCH):
+                loss = functional.mse_loss(net(crops[index], places[index]), aims[index])
+                seen = places[index][..., 5].flatten() > 0
+                pose = aims[index][..., : (size - 2) // 2].flatten(0, 1)[seen]
+                covered = _coarse(crops[index].flatten(0, 1)[seen])
+                loss = loss + functional.mse_loss(net.cover(pose), covered)
+                optimiser.zero_grad()
+                loss.backward()
+                optimiser.step()
+                schedule.step()
+        tensors |= {f"{member}.{name}": x.detach().numpy().copy() for name, x in net.state_dict().items()}
+    return _judged(tensors, shown, train)
+
+
+def _judged(tensors: Mapping[str, np.ndarray], shown: Films, train: int) -> Silhouette:
+    """With how right it is about the films that were held out, and what tells how right it is."""
+    learned = Silhouette(tensors)
+    aims = shown.aims[train:]
+    looked = [
+        learned._signs(Views(crops=crops, places=places))
+        for crops, places in zip(shown.crops[train:], shown.places[train:], strict=True)
+    ]
+    error = np.square(np.stack([each.mean(axis=0) for each, _ in looked]) - aims)
+    spread = np.square(aims - aims.mean(axis=(0, 1))).mean(axis=(0, 1))
+    size = (aims.shape[-1] - 2) // 2
+    wrong = error[..., :size].mean(axis=-1).ravel() / spread[:size].mean()
+    return Silhouette({
+        **tensors,
+        "held_out": 1 - error.mean(axis=(0, 1)) / spread,
+        "doubts": _weights(np.concatenate([signs for _, signs in looked]), wrong),
+    })  # fmt: skip
+
+
+def _weights(signs: np.ndarray, wrong: np.ndarray) -> np.ndarray:
+    """Weights of signs, (n, k), whose sum is nearest to errors, (n,); none below zero."""
+    kept = list(range(signs.shape[1]))
+    while True:
+        weights = np.linalg.lstsq(signs[:, kept], wrong, rcond=None)[0]
+        if (weights >= 0).all() or len(kept) == 1:
+            break
+        del kept[int(np.argmin(weights))]
+    found = np.zeros(signs.shape[1])
+    found[kept] = np.maximum(weights, 0)
+    return found
+
+
+class _Net(nn.Module):
+    """Convolutions over each picture, and then along time."""
+
+    def __init__(self, numbers: int) -> None:
+        super().__init__()
+        layer = nn.utils.skip_init
+        sizes = ((1, 48, 8, 4, 2), (48, 64, 3, 2, 1), (64, 64, 3, 2, 1))
+        self.look = nn.ModuleList([layer(nn.Conv2d, *size) for size in sizes])
+        self.gather = layer(nn.Linear, 64 * (SIDE // 16) ** 2, _WIDTH)
+        steps = ((_WIDTH + PLACES, 1), (_WIDTH, 1), (_WIDTH, 2))
+        self.follow = nn.ModuleList([layer(nn.Conv1d, a, _WIDTH, 3, padding=d, dilation=d) for a, d in steps])
+        self.say = layer(nn.Linear, _WIDTH, numbers)
+        self.cover = nn.Sequential(
+            layer(nn.Linear, (numbers - 2) // 2, 96), nn.ReLU(), layer(nn.Linear, 96, (SIDE // _COARSE) ** 2)
+        )
+
+    def draw_weights(self, generator: torch.Generator) -> None:
+        """Draws first weights, by which signals keep their size (He et al. 2015)."""
+        for weights in self.parameters():
+            if weights.dim() > 1:
+                nn.init.kaiming_normal_(weights, nonlinearity="relu", generator=generator)
+            else:
+                nn.init.zeros_(weights)
+
+    def forward(self, crops: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+        """Numbers of films, (n, T, S, S) uint8 and (n, T, K) to (n, T, A)."""
+        x = crops.flatten(0, 1)[:, None].float().div_(255)
+        for convolution in self.look:
+            x = functional.relu_(convolution(x))
+        x = functional.relu_(self.gather(x.flatten(1))).unflatten(0, crops.shape[:2])
+        x = torch.cat([x, places], dim=-1).transpose(1, 2)
+        for number, convolution in enumerate(self.follow):
+            y = functional.relu(convolution(x))
+            x = y if number == 0 else x + y
+        return self.say(x.transpose(1, 2))
+
+    def drawn(self, pose: np.ndarray) -> np.ndarray:
+        """How far the robot in poses, (F, P), covers each part of the cut-out, as ``_coarse``."""
+        return self.cover(torch.from_numpy(pose)).numpy()
+
+    def along(self, seen: Views) -> np.ndarray:
+        """Numbers of the frames of a video, (F, A)."""
+        return self(torch.from_numpy(seen.crops)[None], torch.from_numpy(seen.places)[None])[0].numpy()
+
+
+def _coarse(crops: torch.Tensor) -> torch.Tensor:
+    """The share of each part of cut-outs that is covered, (F, S, S) uint8 to (F, (S / _COARSE)^2)."""
+    return functional.avg_pool2d(crops[:, None].float().div_(255), _COARSE).flatten(1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,288 @@
+"""Masks of a robot in random states, to learn from: drawn from its model alone, with the faults of real ones.
+
+Physics runs on for a while from random states; MuJoCo draws which pixel shows which geom, for cameras about
+the one that looks at the robot's plane. Masks that are found in videos have other edges than drawn ones,
+holes, and now and then lack a limb: so do these.
+
+Shapes: n short films of T frames, H = W = ``_SIZE``, A numbers to be read (``aims``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+
+from onedemo.render.gl_context import open_context
+from onedemo.rl.random_states import wild_rollouts
+from onedemo.sim import kinematics, vector_env
+from onedemo.vision.silhouette_views import RATE, Views, views
+
+FRAMES = 14
+"""Of each film."""
+_SIZE = 112
+_VIEW = 1.35
+"""Height of what is drawn, in lengths of the robot."""
+_SECONDS = 0.96
+"""How long random states run on before the next."""
+_STANDING = 0.25
+_FILMS_EACH = 2
+"""Of each random state and what comes of it."""
+TRAVEL_SCALE = 0.4
+"""A metre a second of travel counts as this many units of the pose."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Films:
+    """What is learned from."""
+
+    crops: np.ndarray
+    """(n, T, S, S), uint8."""
+    places: np.ndarray
+    """(n, T, K), float32."""
+    aims: np.ndarray
+    """What they show, (n, T, A), float32."""
+    reach: float
+    """Length of the robot stretched out, metres."""
+
+
+def aims(qpos: np.ndarray, qvel: np.ndarray, obs: np.ndarray) -> np.ndarray:
+    """What is to be read of states: pose, motion, travel and contact, (..., A), float32."""
+    travel = TRAVEL_SCALE * qvel[..., :1]
+    lowest = np.minimum.reduce(list(kinematics.clearances(qpos).values()))
+    contact = np.clip(1 - lowest / 0.03, 0, 1)[..., None]
+    numbers = [kinematics.pose(obs), kinematics.motion(obs), travel, contact]
+    return np.concatenate(numbers, axis=-1).astype(np.float32)
+
+
+def names_of(env_name: str) -> list[str]:
+    """Names of the numbers that ``aims`` gives, (A,)."""
+    limbs = [f"{wave} {limb}" for limb in ("torso", "thigh", "leg", "foot") for wave in ("sine", "cosine")]
+    pose = ["height", *limbs]
+    return [*pose, *(f"rate of {number}" for number in pose), "travel", "contact"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Eye:
+    """A camera and how much it shows."""
+
+    azimuth: float
+    """Degrees; 90 looks straight at the plane in which the robot moves."""
+    elevation: float
+    """Degrees; below 0 it looks down."""
+    distance: float
+    """Metres."""
+    view: float
+    """Height of what it shows at the robot, metres."""
+
+    @property
+    def fovy(self) -> float:
+        """Vertical field of view, degrees."""
+        return math.degrees(2 * math.atan(self.view / 2 / self.distance))
+
+    def row_below(self, size: int, depth: np.ndarray) -> np.ndarray:
+        """Rows, of ``size``, of points so many metres below what it looks at."""
+        tilt, focal = math.radians(self.elevation), size * self.distance / self.view
+        return size / 2 + focal * depth * math.cos(tilt) / (self.distance - depth * math.sin(tilt))
+
+
+class Silhouettes:
+    """Draws which geom of a robot each pixel shows. Belongs to the thread that made it; to be closed.
+
+    Args:
+        xml: The robot's model.
+        size: Rows and columns.
+
+    Raises:
+        UserError: If this machine cannot draw.
+    """
+
+    def __init__(self, xml: Path, size: int = _SIZE) -> None:
+        spec = mujoco.MjSpec.from_file(str(xml))
+        spec.visual.global_.offwidth = spec.visual.global_.offheight = size
+        spec.visual.quality.offsamples = 0
+        self.model, self.size = spec.compile(), size
+        self.data = mujoco.MjData(self.model)
+        self._context: Any = open_context(size, size)
+        self._mjr = mujoco.MjrContext(self.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
+        self._scene = mujoco.MjvScene(self.model, maxgeom=self.model.ngeom + 16)
+        for flag, on in (("SHADOW", 0), ("REFLECTION", 0), ("SKYBOX", 0), ("SEGMENT", 1), ("IDCOLOR", 1)):
+            self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = on
+        self._option, self._camera = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._rect = mujoco.MjrRect(0, 0, size, size)
+        self._pixels = np.empty((size, size, 3), np.uint8)
+
+    def middle(self, qpos: np.ndarray) -> np.ndarray:
+        """Where the middle of the robot's geoms is in positions (q,): metres, (3,)."""
+        self.data.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        return self.data.geom_xpos[self.model.geom_bodyid > 0].mean(axis=0)
+
+    def draw(self, qpos: np.ndarray, eye: Eye, at: np.ndarray) -> np.ndarray:
+        """Which geom each pixel shows.
+
+        Args:
+            qpos: Positions, (q,).
+            eye: Looks from where.
+            at: What it looks at, metres, (3,).
+
+        Returns:
+            (H, W), int32; -1 where it is none of the robot's.
+        """
+        model, data, camera = self.model, self.data, self._camera
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        camera.lookat[:] = at
+        camera.azimuth, camera.elevation, camera.distance = eye.azimuth, eye.elevation, eye.distance
+        model.vis.global_.fovy = eye.fovy
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, self._option, None, camera, everything, self._scene)
+        mujoco.mjr_render(self._rect, self._scene, self._mjr)
+        mujoco.mjr_readPixels(self._pixels, None, self._rect, self._mjr)
+        which = np.full(self._scene.ngeom + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and model.geom_bodyid[geom.objid]:
+                which[geom.segid + 1] = geom.objid
+        numbers = self._pixels[::-1].astype(np.int32) @ np.array([1, 1 << 8, 1 << 16], np.int32)
+        return which[np.minimum(numbers, len(which) - 1)]
+
+    def close(self) -> None:
+        """Frees the GL context."""
+        if self._context is not None:
+            self._context.make_current()
+            self._mjr.free()
+            self._context.free()
+            self._context = None
+
+    def __enter__(self) -> Silhouettes:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def films(env_name: str, count: int, seed: int, check: Callable[[float], None]) -> Films:
+    """Draws short films of what random actions do from random and from standing starts.
+
+    Args:
+        env_name: The robot.
+        count: n.
+        seed: Of states, cameras and faults.
+        check: Called now and then with the share that is done; what it raises ends the drawing.
+
+    Raises:
+        UserError: If this machine cannot draw.
+    """
+    spec, rng = vector_env.spec(env_name), np.random.default_rng(seed)
+    qpos, shown = _states(env_name, count, seed, rng)
+    with Silhouettes(spec.xml) as drawing:
+        reach = length_of(drawing, qpos[:, 0])
+        seen = []
+        for number, film in enumerate(qpos):
+            if number % 20 == 0:
+                check(number / count)
+            seen.append(_seen(drawing, film, reach, rng))
+    return Films(
+        crops=np.stack([view.crops for view in seen]), places=np.stack([view.places for view in seen]),
+        aims=shown, reach=reach,
+    )  # fmt: skip
+
+
+def _states(env_name: str, count: int, seed: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of the frames of films, (n, T, q), and what they show, (n, T, A)."""
+    dt = vector_env.spec(env_name).dt
+    every = round(_SECONDS / dt)
+    steps = np.round(np.arange(FRAMES) / RATE / dt).astype(int)
+    starts = -(-count // _FILMS_EACH)
+    rollouts = wild_rollouts(
+        env_name, lanes=-(-starts // 8), steps=8 * every, every=every, seed=seed, standing=_STANDING
+    )
+    lane, episode = np.divmod(rng.permutation(starts).repeat(_FILMS_EACH)[:count], 8)
+    first = rng.integers(every - steps[-1], size=count)
+    at = (lane[:, None], (episode * every + first)[:, None] + steps)
+    qpos, obs = rollouts.qpos[at], rollouts.obs[at]
+    return qpos, aims(qpos, obs[..., qpos.shape[-1] - 1 :], obs)
+
+
+def length_of(drawing: Silhouettes, qpos: np.ndarray) -> float:
+    """Diagonal of the box around the robot in the camera's plane, in its longest of poses (n, q): metres.
+
+    Nearly longest, one in twenty: as it is told from masks of a video.
+    """
+    model, data = drawing.model, drawing.data
+    mine = model.geom_bodyid > 0
+    diagonals = []
+    for q in qpos[:: max(1, len(qpos) // 400)]:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        turn = data.geom_xmat[mine].reshape(-1, 3, 3)
+        middle = data.geom_xpos[mine] + np.einsum("gij,gj->gi", turn, model.geom_aabb[mine, :3])
+        half = np.einsum("gij,gj->gi", np.abs(turn), model.geom_aabb[mine, 3:])
+        sides = (middle + half).max(axis=0) - (middle - half).min(axis=0)
+        diagonals.append(np.hypot(sides[0], sides[2]))
+    return float(np.percentile(diagonals, 95))
+
+
+def _seen(drawing: Silhouettes, qpos: np.ndarray, reach: float, rng: np.random.Generator) -> Views:
+    """What is seen of a film, (T, q)."""
+    eye = Eye(
+        azimuth=90 + rng.uniform(-14, 14), elevation=rng.uniform(-26, 5),
+        distance=reach * rng.uniform(1.7, 3.2), view=reach * _VIEW,
+    )  # fmt: skip
+    aside = np.array([*reach * rng.uniform(-0.1, 0.1, 2), 0.0])[[0, 2, 1]]
+    at = np.stack([drawing.middle(q) for q in qpos]) + aside
+    ids = np.stack([drawing.draw(q, eye, place) for q, place in zip(qpos, at, strict=True)])
+    scale, way = drawing.size / eye.view, at[:, 0]
+    floor = eye.row_below(drawing.size, at[:, 2])
+    masks = _spoilt(ids, floor, reach * scale, rng)
+    floor += scale * (rng.normal(0, 0.03) + rng.normal(0, 0.008, len(qpos)))
+    wrong = rng.uniform(0.9, 1.1)
+    return views(
+        masks,
+        floor=np.full(len(qpos), np.nan) if rng.random() < 0.1 else floor,
+        scale=scale * wrong,
+        way=None if rng.random() < 0.15 else way / wrong + rng.normal(0, 0.004, len(qpos)),
+        reach=reach,
+    )
+
+
+def _spoilt(ids: np.ndarray, floor: np.ndarray, reach: float, rng: np.random.Generator) -> np.ndarray:
+    """Masks as they are found, (T, H, W), bool, of geoms as they are drawn; ``reach`` in pixels."""
+    masks = ids >= 0
+    count, size = len(ids), ids.shape[1]
+    geoms = np.unique(ids[masks])
+    if rng.random() < 0.12 and len(geoms) > 1:  # a limb is lost for a while
+        first, last = np.sort(rng.integers(count + 1, size=2))
+        masks[first:last] &= ids[first:last] != rng.choice(geoms)
+    blur, edge, rough = rng.uniform(0.4, 1.8), rng.uniform(0.32, 0.6), rng.uniform(0, 0.25)
+    grown = int(rng.choice([0, 1, -1], p=[0.65, 0.3, 0.05]))
+    shadow = rng.random() < 0.1
+    spoilt = np.empty_like(masks)
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    for index, mask in enumerate(masks):
+        if rng.random() < 0.02:
+            spoilt[index] = False
+            continue
+        solid = mask.astype(np.float32)
+        if grown:
+            solid = (cv2.dilate if grown > 0 else cv2.erode)(solid, cross)
+        places = np.argwhere(mask)
+        if len(places) and rng.random() < 0.2:
+            row, column = places[rng.integers(len(places))]
+            axes = tuple(int(x) for x in rng.uniform(0.02, 0.09, 2) * reach)
+            cv2.ellipse(solid, (int(column), int(row)), axes, rng.uniform(0, 180), 0, 360, 0.0, -1)
+        if len(places) and shadow:
+            middle = (int(places[:, 1].mean() + rng.normal(0, 2)), int(floor[index]))
+            axes = (int(rng.uniform(0.1, 0.3) * reach), int(rng.uniform(0.01, 0.04) * reach))
+            cv2.ellipse(solid, middle, axes, 0, 0, 360, 1.0, -1)
+        solid = cv2.GaussianBlur(solid, (0, 0), blur)
+        noise = rng.normal(0, rough, (size // 4, size // 4)).astype(np.float32)
+        spoilt[index] = solid + cv2.resize(noise, (size, size)) * (solid > 0.02) > edge
+    return spoilt
