@@ -26,6 +26,7 @@ from onedemo.app.http.commands import Actions
 from onedemo.app.http.curves import Curves
 from onedemo.app.http.exports import Downloads
 from onedemo.app.http.invitations import page_address
+from onedemo.app.http.mask_preview import MaskPreview
 from onedemo.app.http.media import Files, Filmed
 from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
@@ -169,6 +170,7 @@ class Front:
             Route("GET", UPLOAD + "/poster.jpg", "researcher", uploads.poster),
             Route("POST", UPLOAD + "/result", "researcher", uploads.bring_in),
             Route("GET", UPLOAD + r"/result-{result:\d{1,6}}.webm", "researcher", uploads.result),
+            Route("POST", UPLOAD + "/mask", "researcher", MaskPreview(uploads).find),
             Route("POST", UPLOAD + "/keep", "researcher", uploads.keep, "added a demo"),
             Route("POST", UPLOAD + "/discard", "researcher", uploads.discard),
         )

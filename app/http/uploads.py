@@ -162,6 +162,15 @@ class Uploads:
         about = {"result": upload.shown, "known": known.name if known else None, "warnings": said}
         return web.json_response(facts | about)
 
+    @asynccontextmanager
+    async def result_of(self, request: web.Request) -> AsyncIterator[Path]:
+        """Where what the demo would be lies, for one request at a time that works on it."""
+        async with self._upload(request) as upload:
+            with self._at_work(), _sentences("mask"), _named(upload.result / "video.webm"):
+                if not (upload.result / "demo.json").is_file():
+                    raise ValueError("choose a part and look at the result first")
+                yield upload.result
+
     async def result(self, request: web.Request) -> web.StreamResponse:
         """What the demo would be, as video."""
         async with self._upload(request) as upload:

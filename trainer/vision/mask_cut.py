@@ -1,21 +1,22 @@
 """The mover cut out of each picture: evidence of motion, its colours, and the edges of the picture together.
 
-Shapes: F pictures, H rows, W columns; evidence is 0 (background) to 1.
+Shapes: F pictures, H rows, W columns; evidence is uint8, from 0, background, to 255.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 
 import cv2
 import numpy as np
 
-from onedemo.vision.mask_hints import Hints
+from onedemo.vision.mask_hints import Box, Click
 
 _BINS = 16
 """Of each colour, in the table of the mover's colours."""
-_SURE = 0.75
+_SURE, _SOME = 190, 75
+"""Evidence that is the mover, and that may be."""
 _LEAST = 0.0012
 """Share of a picture that a mover covers at least."""
 _LARGE = 0.45
@@ -28,17 +29,21 @@ class Colours:
 
     Args:
         frames: (F, H, W, 3), uint8 RGB.
-        inside: How surely each pixel is of the mover, (F, H, W), 0..1.
-        outside: How surely it is not.
+        inside: What is of the mover, (F, H, W), bool.
+        outside: What is not.
+        share: How much each place counts of what is not, (H, W), 0..1; None: all the same.
     """
 
-    def __init__(self, frames: np.ndarray, inside: np.ndarray, outside: np.ndarray) -> None:
+    def __init__(
+        self, frames: np.ndarray, inside: np.ndarray, outside: np.ndarray, share: np.ndarray | None = None
+    ) -> None:
         tables = []
-        for weight in (inside, outside):
+        for where, weight in ((inside, None), (outside, share)):
             table = np.zeros(_BINS**3)
-            for frame, share in zip(frames, weight, strict=True):
-                if share.any():
-                    table += np.bincount(_cells(frame).ravel(), share.ravel(), _BINS**3)
+            for frame, here in zip(frames, where, strict=True):
+                if here.any():
+                    weights = None if weight is None else weight[here]
+                    table += np.bincount(_cells(frame)[here], weights, _BINS**3)
             table = table.reshape((_BINS,) * 3)
             for axis in range(3):  # neighbours in colour are alike
                 padded = np.concatenate([table.take([0], axis), table, table.take([-1], axis)], axis)
@@ -64,13 +69,13 @@ def _cells(frame: np.ndarray) -> np.ndarray:
 
 
 def seeds_of(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is surely of the mover, and what surely is not, by the evidence alone, (F, H, W) each, 0 or 1."""
-    inside = np.zeros(evidence.shape, np.float32)
-    outside = np.zeros(evidence.shape, np.float32)
+    """What is surely of the mover, and what surely is not, by the evidence alone, (F, H, W) each, bool."""
+    inside = np.zeros(evidence.shape, bool)
+    outside = np.zeros(evidence.shape, bool)
     for index, shown in enumerate(evidence):
         solid = cv2.morphologyEx((shown > _SURE).astype(np.uint8), cv2.MORPH_OPEN, _ROUND)
         inside[index] = largest(solid)
-        near = cv2.dilate((shown > 0.3).astype(np.uint8), np.ones((5, 5), np.uint8))
+        near = cv2.dilate((shown > _SOME).astype(np.uint8), np.ones((5, 5), np.uint8))
         outside[index] = near == 0
     sizes = inside.mean(axis=(1, 2))
     usual = np.median(sizes[sizes > 0]) if (sizes > 0).any() else 0.0
@@ -135,7 +140,7 @@ def _cut_one(
     height, width = frame.shape[:2]
     odds = 0.7 * np.clip(colours.odds(frame), -5, 5)
     if shown is not None:
-        odds = odds + 5 * (shown - 0.45)
+        odds = odds + 5 * (shown / np.float32(255) - 0.45)
     if near is not None:
         reach = max(3, round(0.35 * np.sqrt(near.sum())))
         away = cv2.distanceTransform((~near).astype(np.uint8), cv2.DIST_L2, 3)
@@ -174,38 +179,49 @@ def _sharpened(frame: np.ndarray, mover: np.ndarray, odds: np.ndarray) -> np.nda
     return found if found.sum() > 0.4 * mover.sum() else mover
 
 
-def chosen(frame: np.ndarray, hints: Hints, index: int) -> np.ndarray:
-    """What somebody means in one picture, (H, W), bool: GrabCut from the box and the clicks on it.
+def boxed(frame: np.ndarray, box: Box, clicks: Iterable[Click] = ()) -> np.ndarray:
+    """What somebody means with a box around it, (H, W), bool: GrabCut from there.
 
     Args:
-        frame: (H, W, 3), uint8 RGB.
-        hints: In pixels of this size; those of other pictures are left out.
-        index: The number of this one.
+        frame: The picture with the box, (H, W, 3), uint8 RGB.
+        box: All of the mover is inside.
+        clicks: Places; those of other pictures are left out.
     """
-    height, width = frame.shape[:2]
-    states = np.full((height, width), cv2.GC_PR_BGD, np.uint8)
-    radius = max(2, round(width / 80))
-    clicks = [click for click in hints.clicks if click.frame == index]
-    box = hints.box if hints.box is not None and hints.box.frame == index else None
-    if box is not None:
-        states[:] = cv2.GC_BGD
-        left, top = max(0, round(box.x)), max(0, round(box.y))
-        states[top : round(box.y + box.height), left : round(box.x + box.width)] = cv2.GC_PR_FGD
-    else:
-        for click in clicks:
-            if click.inside:
-                cv2.circle(states, (round(click.x), round(click.y)), round(0.2 * height), cv2.GC_PR_FGD, -1)
-    for click in clicks:
-        state = cv2.GC_FGD if click.inside else cv2.GC_BGD
-        cv2.circle(states, (round(click.x), round(click.y)), radius, state, -1)
-    if not (states & 1).any() or (states & 1).all():
-        return np.zeros((height, width), bool)
+    states = np.full(frame.shape[:2], cv2.GC_BGD, np.uint8)
+    left, top = max(0, round(box.x)), max(0, round(box.y))
+    states[top : round(box.y + box.height), left : round(box.x + box.width)] = cv2.GC_PR_FGD
+    _mark(states, clicks, box.frame)
     _grab(frame, states, 5)
     return (states & 1).astype(bool)
 
 
+def clicked(frame: np.ndarray, mask: np.ndarray, clicks: Iterable[Click], index: int) -> np.ndarray:
+    """What somebody means with places that are the mover or are not, (H, W), bool.
+
+    Args:
+        frame: (H, W, 3), uint8 RGB.
+        mask: What is taken to be the mover, (H, W), bool.
+        clicks: Places; those of other pictures are left out.
+        index: The number of this picture.
+    """
+    states = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    _mark(states, clicks, index)
+    _grab(frame, states, 3)
+    return (states & 1).astype(bool)
+
+
+def _mark(states: np.ndarray, clicks: Iterable[Click], index: int) -> None:
+    radius = max(2, round(states.shape[1] / 80))
+    for click in clicks:
+        if click.frame == index:
+            state = cv2.GC_FGD if click.inside else cv2.GC_BGD
+            cv2.circle(states, (round(click.x), round(click.y)), radius, int(state), -1)
+
+
 def _grab(frame: np.ndarray, states: np.ndarray, rounds: int) -> None:
     """GrabCut, in place; the same for the same picture."""
+    if not (states & 1).any() or (states & 1).all():
+        return
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     with suppress(cv2.error):  # too few pixels of one kind: they stay as they are

@@ -3,7 +3,7 @@
 The background of a camera that stands is the median of all pictures; of one that goes, the median of
 neighbours in time, each brought to where its floor lies in the picture looked at.
 
-Shapes: F pictures, H rows, W columns; evidence is 0 (background) to 1.
+Shapes: F pictures, H rows, W columns; evidence is uint8, from 0, background, to 255.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def before_still(frames: np.ndarray) -> np.ndarray:
         frames: (F, H, W, 3), uint8 RGB.
 
     Returns:
-        (F, H, W), float32.
+        (F, H, W), uint8.
     """
     some = frames[np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int)]
     background = np.median(some, axis=0).astype(np.uint8)
@@ -51,7 +51,7 @@ def before_moving(frames: np.ndarray, motion: Motion, rows: np.ndarray) -> np.nd
     height, width = frames.shape[1:3]
     place = np.stack([np.full(len(frames), width / 2), rows], axis=1)
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(motion.shifts(place), axis=1))])
-    evidence = np.empty(frames.shape[:3], np.float32)
+    evidence = np.empty(frames.shape[:3], np.uint8)
     for index, frame in enumerate(frames):
         stack = []
         for other in _neighbours(index, gone, _FAR * width):
@@ -84,7 +84,7 @@ def _neighbours(index: int, gone: np.ndarray, far: float) -> list[int]:
 
 
 def _difference(frame: np.ndarray, background: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Evidence, 0..1, of one picture, given what noise does to the background, (H, W)."""
+    """Evidence of one picture, given what noise does to the background, (H, W)."""
     other = cv2.GaussianBlur(cv2.absdiff(frame, background), (0, 0), 0.8).max(axis=2).astype(np.float32)
     low = _LOW + 2 * noise
-    return np.clip((other - low) / (_HIGH - _LOW + noise), 0, 1)
+    return (255 * np.clip((other - low) / (_HIGH - _LOW + noise), 0, 1)).astype(np.uint8)

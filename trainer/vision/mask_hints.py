@@ -41,7 +41,7 @@ class Hints:
     clicks: tuple[Click, ...] = ()
 
     def __bool__(self) -> bool:
-        return self.box is not None or any(click.inside for click in self.clicks)
+        return self.box is not None or bool(self.clicks)
 
     def scaled(self, by: float) -> Hints:
         """The same of pictures of another size, ``by`` times as large."""

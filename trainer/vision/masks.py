@@ -20,7 +20,7 @@ import numpy as np
 from onedemo.render.mover import is_studio, solid_in_studio, way_in_studio
 from onedemo.render.renderer import CAMERA_HEIGHT, FREE_ABOVE, studio
 from onedemo.vision.mask_camera import Motion, follow_background
-from onedemo.vision.mask_cut import Colours, chosen, cut, seeds_of
+from onedemo.vision.mask_cut import Colours, boxed, clicked, cut, seeds_of
 from onedemo.vision.mask_evidence import before_moving, before_still
 from onedemo.vision.mask_hints import Hints
 
@@ -34,6 +34,10 @@ _CHANGED = 0.15
 """Share of the picture that may differ from the median picture where the camera stands."""
 _AROUND = 2
 """Pictures before and after with which a mask is compared."""
+
+
+_Found = tuple[np.ndarray, np.ndarray, float]
+"""Masks, how large what else might be the mover is beside each, and how far apart the colours are."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -111,14 +115,14 @@ def find_masks(
         evidence = before_moving(frames, motion, np.full(len(frames), 0.85 * frames.shape[1]))
     check(0.5)
     method = "still" if still else "following" if evidence is not None else "colour"
+    found = None if evidence is None else _by_evidence(frames, evidence)
     if hints:
-        method = "chosen"
-        masks, others, apart = _chosen(frames, evidence, hints)
-    else:
-        found = None if evidence is None else _by_evidence(frames, evidence)
-        if found is None:
-            method, found = "colour", _by_colour(frames)
-        masks, others, apart = found
+        method, found = "chosen", _marked(frames, evidence, hints, found)
+    elif found is None:
+        method, found = "colour", _by_colour(frames)
+    if found is None:
+        found = np.zeros(frames.shape[:3], bool), np.ones(len(frames)), 0.0
+    masks, others, apart = found
     check(0.9)
     if not still:  # again, without the mover
         motion = follow_background(greys, masks)
@@ -172,34 +176,34 @@ def _stands(frames: np.ndarray, motion: Motion) -> bool:
     return motion.known or float(np.mean(changed)) < _CHANGED
 
 
-def _by_evidence(frames: np.ndarray, evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+def _by_evidence(frames: np.ndarray, evidence: np.ndarray) -> _Found | None:
     inside, outside = seeds_of(evidence)
     if (inside.any(axis=(1, 2))).sum() < max(2, len(frames) // 20):
         return None
-    colours = Colours(frames, inside, _spread(outside, inside))
-    start = int(np.argmax((inside * evidence).sum(axis=(1, 2))))
+    colours = Colours(frames, inside, outside, _share(inside))
+    start = int(np.argmax(inside.sum(axis=(1, 2))))
     masks, others = cut(frames, evidence, colours, start)
     return masks, others, colours.apart
 
 
-def _spread(outside: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """What is surely not the mover, less so where it often is: who stays in a place is part of the median."""
+def _share(inside: np.ndarray) -> np.ndarray | None:
+    """How much each place counts as background, (H, W): less where the mover often is, as in the median."""
     often = inside.mean(axis=0) > 0.03
     if not often.any():
-        return outside
+        return None
     hull = np.zeros(often.shape, np.uint8)
     points = cv2.findNonZero(often.astype(np.uint8))
     cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
-    return outside * np.where(hull > 0, np.float32(0.1), np.float32(1.0))
+    return np.where(hull > 0, np.float32(0.1), np.float32(1.0))
 
 
-def _by_colour(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def _by_colour(frames: np.ndarray) -> _Found:
     """By the colours in the middle that are not those of the border, learned anew from what they show."""
     height, width = frames.shape[1:3]
     rows, columns = np.mgrid[:height, :width]
     away = np.hypot((columns + 0.5) / width - 0.5, ((rows + 0.5) / height - 0.5) * height / width)
-    inside = np.broadcast_to((away < 0.16).astype(np.float32), frames.shape[:3])
-    outside = np.broadcast_to((away > 0.36).astype(np.float32), frames.shape[:3])
+    inside = np.broadcast_to(away < 0.16, frames.shape[:3])
+    outside = np.broadcast_to(away > 0.36, frames.shape[:3])
     masks = np.zeros(frames.shape[:3], bool)
     for _ in range(3):
         colours = Colours(frames, inside, outside)
@@ -207,24 +211,36 @@ def _by_colour(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         if not masks.any():
             break
         grown = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) for mask in masks])
-        inside, outside = masks.astype(np.float32), (grown == 0).astype(np.float32)
+        inside, outside = masks, grown == 0
     return masks, others, colours.apart
 
 
-def _chosen(
-    frames: np.ndarray, evidence: np.ndarray | None, hints: Hints
-) -> tuple[np.ndarray, np.ndarray, float]:
-    marked = sorted({c.frame for c in hints.clicks} | ({hints.box.frame} if hints.box else set()))
-    seeds = {index: chosen(frames[index], hints, index) for index in marked}
+def _marked(
+    frames: np.ndarray, evidence: np.ndarray | None, hints: Hints, found: _Found | None
+) -> _Found | None:
+    """From the box, or what was found without it, and then with the places that are the mover or are not."""
+    if hints.box is not None:
+        index = hints.box.frame
+        found = _from_seeds(frames, evidence, {index: boxed(frames[index], hints.box, hints.clicks)})
+    elif found is None:
+        found = _by_colour(frames)
+    marked = {click.frame for click in hints.clicks}
+    if not marked or found is None:
+        return found
+    seeds = {index: clicked(frames[index], found[0][index], hints.clicks, index) for index in sorted(marked)}
+    return _from_seeds(frames, evidence, seeds)
+
+
+def _from_seeds(
+    frames: np.ndarray, evidence: np.ndarray | None, seeds: dict[int, np.ndarray]
+) -> _Found | None:
     seeds = {index: seed for index, seed in seeds.items() if seed.any()}
     if not seeds:
-        return np.zeros(frames.shape[:3], bool), np.ones(len(frames)), 0.0
-    some = frames[list(seeds)]
-    inside = np.stack(list(seeds.values())).astype(np.float32)
-    colours = Colours(some, inside, 1 - inside)
-    start = hints.box.frame if hints.box and hints.box.frame in seeds else next(iter(seeds))
-    masks, others = cut(frames, evidence, colours, start, seeds)
-    return masks, others, colours.apart
+        return None
+    inside = np.stack(list(seeds.values()))
+    colours = Colours(frames[list(seeds)], inside, ~inside)
+    start = max(seeds, key=lambda index: seeds[index].sum())
+    return *cut(frames, evidence, colours, start, seeds), colours.apart
 
 
 def _ground(masks: np.ndarray, motion: Motion | None) -> tuple[np.ndarray, np.ndarray | None]:
