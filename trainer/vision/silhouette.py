@@ -23,14 +23,17 @@ from onedemo.vision import learned_robots
 from onedemo.vision.masks import Masks
 from onedemo.vision.pose_estimator import Track
 from onedemo.vision.silhouette_pictures import Films, films
-from onedemo.vision.silhouette_views import PLACES, RATE, SIDE, Views, views
+from onedemo.vision.silhouette_views import FOUND, PLACES, RATE, SIDE, Views, views
 
 VERSION = 1
 """Raise it when what is drawn or how it is learned changes."""
 MEMBERS = 2
+"""Networks: the one that is learned, as it is at the end of each of the last cycles (Huang et al. 2017)."""
 _SEED = 30_000
 _FILMS = 2000
-_EPOCHS = 12
+_EPOCHS = 7
+"""Passes over them in each of some cycles of the learning rate."""
+_CYCLES = 3
 _BATCH = 12
 """Films at a time."""
 _RATE = 2e-3
@@ -45,7 +48,7 @@ _COARSE = 4
 
 
 class Silhouette:
-    """Reads pose, motion, travel and contact from silhouettes: a few small networks, averaged.
+    """Reads pose, motion, travel and contact from silhouettes: two small networks, averaged.
 
     Args:
         tensors: Their weights, and how right they were, as ``learn`` gives them.
@@ -113,7 +116,7 @@ class Silhouette:
         numbers, doubt = self.read(Views(crops=seen.crops[nearest], places=seen.places[nearest]))
         at = np.stack([np.interp(times, looked, column) for column in numbers.T], axis=1)
         doubt = np.maximum(np.interp(times, looked, doubt), found.doubt)
-        return at, np.where(seen.places[:, 5] > 0, doubt, 1.0)
+        return at, np.where(seen.places[:, FOUND] > 0, doubt, 1.0)
 
     def track(self, found: Masks, fps: float) -> Track:
         """Pose, motion, travel and contact in the frames of a video; arguments as of ``numbers``."""
@@ -153,7 +156,7 @@ def learn(
         cache_dir: Where it is kept, by the robot's model.
         check: Called now and then with the share that is done; what it raises ends the learning.
         count: Films to learn from, where it is not known yet.
-        epochs: Passes over them.
+        epochs: Passes over them in a cycle.
         shipped: Whether what comes with the program will do.
 
     Raises:
@@ -184,7 +187,7 @@ def fit(
     Args:
         shown: What is learned from.
         check: Called before each pass over them with the share that is done; what it raises ends the fit.
-        epochs: Passes over them.
+        epochs: Passes over them in a cycle.
     """
     with _one_thread():
         return _fit(shown, check, epochs)
@@ -198,25 +201,23 @@ def _fit(shown: Films, check: Callable[[float], None], epochs: int) -> Silhouett
     tensors: dict[str, np.ndarray] = {
         "reach": np.array(shown.reach), "held_out": np.zeros(size), "doubts": np.zeros(4),
     }  # fmt: skip
-    updates = epochs * -(-train // _BATCH)
-    for member in range(MEMBERS):
-        net = _Net(size)
-        net.draw_weights(generator)
-        optimiser = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=2e-2, fused=True)
+    net = _Net(size)
+    net.draw_weights(generator)
+    for cycle in range(_CYCLES):
+        optimiser = torch.optim.AdamW(net.parameters(), weight_decay=2e-2, fused=True)
+        updates = epochs * -(-train // _BATCH)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=updates)
         for epoch in range(epochs):
-            check((member + epoch / epochs) / MEMBERS)
+            check((cycle + epoch / epochs) / _CYCLES)
             for index in torch.randperm(train, generator=generator).split(_BATCH):
-                loss = functional.mse_loss(net(crops[index], places[index]), aims[index])
-                seen = places[index][..., 5].flatten() > 0
-                pose = aims[index][..., : (size - 2) // 2].flatten(0, 1)[seen]
-                covered = _coarse(crops[index].flatten(0, 1)[seen])
-                loss = loss + functional.mse_loss(net.cover(pose), covered)
+                loss = net.loss(crops[index], places[index], aims[index])
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
                 schedule.step()
-        tensors |= {f"{member}.{name}": x.detach().numpy().copy() for name, x in net.state_dict().items()}
+        if (member := cycle + MEMBERS - _CYCLES) >= 0:
+            state = net.state_dict()
+            tensors |= {f"{member}.{name}": x.detach().numpy().copy() for name, x in state.items()}
     return _judged(tensors, shown, train)
 
 
@@ -287,6 +288,13 @@ class _Net(nn.Module):
             y = functional.relu(convolution(x))
             x = y if number == 0 else x + y
         return self.say(x.transpose(1, 2))
+
+    def loss(self, crops: torch.Tensor, places: torch.Tensor, aims: torch.Tensor) -> torch.Tensor:
+        """How wrong it is about films, and about what pixels the robot covers in the poses that they show."""
+        read = functional.mse_loss(self(crops, places), aims)
+        found = places[..., FOUND].flatten() > 0
+        pose = aims[..., : (aims.shape[-1] - 2) // 2].flatten(0, 1)[found]
+        return read + functional.mse_loss(self.cover(pose), _coarse(crops.flatten(0, 1)[found]))
 
     def drawn(self, pose: np.ndarray) -> np.ndarray:
         """How far the robot in poses, (F, P), covers each part of the cut-out, as ``_coarse``."""

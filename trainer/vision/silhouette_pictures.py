@@ -255,34 +255,60 @@ def _seen(drawing: Silhouettes, qpos: np.ndarray, reach: float, rng: np.random.G
 
 def _spoilt(ids: np.ndarray, floor: np.ndarray, reach: float, rng: np.random.Generator) -> np.ndarray:
     """Masks as they are found, (T, H, W), bool, of geoms as they are drawn; ``reach`` in pixels."""
-    masks = ids >= 0
-    count, size = len(ids), ids.shape[1]
-    geoms = np.unique(ids[masks])
-    if rng.random() < 0.12 and len(geoms) > 1:  # a limb is lost for a while
-        first, last = np.sort(rng.integers(count + 1, size=2))
+    masks, geoms = ids >= 0, np.unique(ids[ids >= 0])
+    bad = rng.choice([0.0, 0.5, 1.0], p=[0.25, 0.45, 0.3])  # some videos are easy, some are not
+    if rng.random() < 0.35 * bad and len(geoms) > 1:  # a limb is lost for a while
+        first, last = np.sort(rng.integers(len(ids) + 1, size=2))
         masks[first:last] &= ids[first:last] != rng.choice(geoms)
-    blur, edge, rough = rng.uniform(0.4, 1.8), rng.uniform(0.32, 0.6), rng.uniform(0, 0.25)
-    grown = int(rng.choice([0, 1, -1], p=[0.65, 0.3, 0.05]))
-    shadow = rng.random() < 0.1
+    blur, edge = rng.uniform(0.4, 1.8), rng.uniform(0.32, 0.6)
+    rough, grown = 0.3 * bad * rng.random(), int(rng.choice([0, 1, -1], p=[0.6, 0.35, 0.05]))
+    shadow, mirrored = rng.random(2) < 0.25 * bad
     spoilt = np.empty_like(masks)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     for index, mask in enumerate(masks):
-        if rng.random() < 0.02:
+        if not mask.any() or rng.random() < 0.03 * bad:
             spoilt[index] = False
             continue
         solid = mask.astype(np.float32)
         if grown:
             solid = (cv2.dilate if grown > 0 else cv2.erode)(solid, cross)
         places = np.argwhere(mask)
-        if len(places) and rng.random() < 0.2:
-            row, column = places[rng.integers(len(places))]
-            axes = tuple(int(x) for x in rng.uniform(0.02, 0.09, 2) * reach)
-            cv2.ellipse(solid, (int(column), int(row)), axes, rng.uniform(0, 180), 0, 360, 0.0, -1)
-        if len(places) and shadow:
+        if rng.random() < 0.35 * bad:  # a piece is lost, or something beside it is taken for it
+            _ellipse(solid, places, reach * rng.uniform(0.02, 0.12, 2), rng, float(rng.random() < 0.35))
+        if rng.random() < 0.25 * bad:  # it is cut in two
+            _band(solid, places, reach * rng.uniform(0.03, 0.16), rng)
+        if shadow:
             middle = (int(places[:, 1].mean() + rng.normal(0, 2)), int(floor[index]))
             axes = (int(rng.uniform(0.1, 0.3) * reach), int(rng.uniform(0.01, 0.04) * reach))
             cv2.ellipse(solid, middle, axes, 0, 0, 360, 1.0, -1)
+        if mirrored and rng.random() < 0.8:
+            _mirror(solid, floor[index], reach * rng.uniform(0.03, 0.3))
         solid = cv2.GaussianBlur(solid, (0, 0), blur)
-        noise = rng.normal(0, rough, (size // 4, size // 4)).astype(np.float32)
-        spoilt[index] = solid + cv2.resize(noise, (size, size)) * (solid > 0.02) > edge
+        if rough:
+            noise = rng.normal(0, rough, [side // 4 for side in mask.shape]).astype(np.float32)
+            solid += cv2.resize(noise, mask.shape[::-1]) * (solid > 0.02)
+        spoilt[index] = solid > edge
     return spoilt
+
+
+def _ellipse(
+    solid: np.ndarray, places: np.ndarray, axes: np.ndarray, rng: np.random.Generator, fill: float
+) -> None:
+    row, column = places[rng.integers(len(places))]
+    size = (int(axes[0]), int(axes[1]))
+    cv2.ellipse(solid, (int(column), int(row)), size, rng.uniform(0, 180), 0, 360, fill, -1)
+
+
+def _band(solid: np.ndarray, places: np.ndarray, width: float, rng: np.random.Generator) -> None:
+    """Takes a straight band out of what is solid."""
+    row, column = places[rng.integers(len(places))]
+    turn, (rows, columns) = rng.uniform(0, np.pi), np.indices(solid.shape, np.float32)
+    solid[np.abs((rows - row) * np.sin(turn) + (columns - column) * np.cos(turn)) < width / 2] = 0
+
+
+def _mirror(solid: np.ndarray, floor: float, depth: float) -> None:
+    """Adds what a polished floor shows of it, down to so many pixels."""
+    flip = np.array([[1, 0, 0], [0, -1, 2 * floor]], np.float32)
+    mirrored = cv2.warpAffine(solid, flip, solid.shape[::-1])
+    top, bottom = (int(np.clip(row, 0, len(solid))) for row in (floor, floor + depth))
+    np.maximum(solid[top:bottom], mirrored[top:bottom], out=solid[top:bottom])

@@ -21,6 +21,8 @@ RATE = 30.0
 PLACES = 8
 """Middle, lower and upper edge above the floor; speed to the right and up; what of it is known: mask, way,
 floor."""
+FOUND = 5
+"""Which of them says whether there is a mask."""
 _ACROSS = 1.15
 """The cut-out, in lengths of the robot."""
 _SPEED = 0.2
@@ -98,7 +100,7 @@ def _places(
         places[:, 4] = _SPEED * _rates(-edges[:, 1] / scale, fps)
     if way is not None:
         places[:, 3] = _SPEED * _rates(edges[:, 0] / scale + way, fps)
-    places[:, 5], places[:, 6], places[:, 7] = seen, way is not None, known
+    places[:, FOUND], places[:, 6], places[:, 7] = seen, way is not None, known
     return places
 
 
