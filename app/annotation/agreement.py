@@ -15,7 +15,7 @@ from typing import NamedTuple
 import krippendorff
 import numpy as np
 
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.storage.store import Store
 
 _CLASSES = 5
@@ -128,7 +128,7 @@ def verdict(alpha: float | None) -> str:
 
 def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
-    dt = vector_env.spec("hopper").dt
+    dt = robot_named("hopper").dt
     columns = ("clip_id", "rater", "value", "repeat", "latency_ms", "predicted", "steps")
     rows = store.ratings.newest(run, most, columns)
     return [

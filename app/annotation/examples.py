@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from onedemo.sim import kinematics
+from onedemo.sim.kinematics import HEIGHT_SCALE
 from onedemo.vision.pose_estimator import Track
 
 _WEIGHTS = np.array([1.0, 0.7, 0.7, 0.5])
@@ -158,7 +158,7 @@ def _seen(track: Track) -> tuple[np.ndarray, np.ndarray]:
     """
     pose = np.concatenate([track.pose[:, :1], track.pose[:, 1:] * np.repeat(_WEIGHTS, 2)], axis=1)
     spin = track.motion[:, 1] * track.pose[:, 2] - track.motion[:, 2] * track.pose[:, 1]
-    return pose, np.stack([spin, track.motion[:, 0] / kinematics.HEIGHT_SCALE], axis=1)
+    return pose, np.stack([spin, track.motion[:, 0] / HEIGHT_SCALE], axis=1)
 
 
 def _distances(tracks: Sequence[Track], length: int) -> np.ndarray:

@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from onedemo.rl.rollouts import Acting
+from onedemo.robots.registry import robot_named
 from onedemo.sim import vector_env
 
 log = logging.getLogger("onedemo.page")
@@ -61,7 +62,7 @@ class Live:
         *, frames_per_second: float = 30.0,
     ) -> None:  # fmt: skip
         self._acting = acting
-        spec = vector_env.spec(environment)
+        spec = robot_named(environment)
         self.model_path = spec.xml
         self._dt = spec.dt
         self._horizon = max(1, round(seconds / spec.dt))

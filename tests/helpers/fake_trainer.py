@@ -53,13 +53,15 @@ def clip_picture(start: int, *phases: float) -> bytes:
 
 def drawn_track() -> Track:
     """What ``drawn_frames`` of the demo show, as if the stick were a robot."""
-    from onedemo.sim import kinematics
+    from onedemo.robots.registry import robot_named
+    from onedemo.sim.kinematics import body_of
     from onedemo.vision.pose_estimator import Track
 
+    body = body_of(robot_named("hopper"))
     spin = 2 * np.pi / 60 * FPS
     angles = np.repeat(spin / FPS * np.arange(DEMO_FRAMES)[:, None], 4, axis=1)
-    pose = kinematics.pose_of(np.full(DEMO_FRAMES, 1.2), angles)
-    motion = kinematics.motion_of(np.zeros(DEMO_FRAMES), angles, np.full_like(angles, spin))
+    pose = body.pose_of(np.full(DEMO_FRAMES, 1.2), angles)
+    motion = body.motion_of(np.zeros(DEMO_FRAMES), angles, np.full_like(angles, spin))
     return Track(pose=pose.astype(np.float32), motion=motion.astype(np.float32))
 
 

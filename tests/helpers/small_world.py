@@ -14,10 +14,14 @@ from onedemo.config import load_config
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, save_hidden
 from onedemo.demos.video import write_webm
 from onedemo.render.renderer import Renderer
-from onedemo.sim import kinematics, vector_env
-from onedemo.sim.kinematics import joint_points
+from onedemo.robots.hopper import joint_points
+from onedemo.robots.registry import robot_named
+from onedemo.sim import vector_env
+from onedemo.sim.kinematics import body_of
 from onedemo.types import Demo
 from onedemo.vision.pose_estimator import Track
+
+BODY = body_of(robot_named("hopper"))
 
 STEPS = 250
 FRAMES = 60
@@ -54,9 +58,7 @@ def drawn_demo(directory: Path, seed: int = 0) -> Demo:
 def falling_track(seed: int = 0) -> Track:
     """What a perfect eye would see in the demo."""
     obs = falling_states(seed).obs[FRAME_STEPS]
-    return Track(
-        pose=kinematics.pose(obs).astype(np.float32), motion=kinematics.motion(obs).astype(np.float32)
-    )
+    return Track(pose=BODY.pose(obs).astype(np.float32), motion=BODY.motion(obs).astype(np.float32))
 
 
 @functools.cache

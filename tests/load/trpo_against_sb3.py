@@ -45,7 +45,7 @@ def ours(steps, seed):
         trpo.update(batch)
     seconds = time.monotonic() - started
     episodes = evaluate(policy.snapshot(), "hopper", episodes=EPISODES, seed=1000 + seed)
-    upright = vector_env.healthy(env.env_spec, episodes.qpos, episodes.qvel)
+    upright = env.robot.healthy(episodes.qpos, episodes.qvel)
     alive = np.logical_and.accumulate(upright[:, :-1], axis=1)  # the falling step still counts
     return (episodes.rewards * alive).sum(1).mean(), seconds
 

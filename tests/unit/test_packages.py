@@ -14,6 +14,7 @@ from helpers.paths import ROOT
 
 ORDER = (
     "errors types static core",
+    "robots",
     "storage sim render queries",
     "demos",
     "rl",

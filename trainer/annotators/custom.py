@@ -28,7 +28,7 @@ from onedemo.demos.frame_clock import frame_of_step
 from onedemo.demos.library import read_frames
 from onedemo.errors import UserError
 from onedemo.render.clip_image import fit
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.types import Demo, Segment
 
 
@@ -53,7 +53,7 @@ class OwnRater(Budget):
         super().__init__(budget, given)
         self.name = name
         self._rate = _find(name)
-        self._demo, self._dt = demo, vector_env.spec("hopper").dt
+        self._demo, self._dt = demo, robot_named("hopper").dt
         self._frames: np.ndarray | None = None
         self._renderer: Any = None
 

@@ -23,8 +23,8 @@ import numpy as np
 from onedemo.annotators.base import DistanceAnnotator
 from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
-from onedemo.sim import vector_env
-from onedemo.sim.kinematics import CONTACT_MARGIN, clearances
+from onedemo.robots.hopper import CONTACT_MARGIN, clearances
+from onedemo.robots.registry import robot_named
 from onedemo.types import Demo
 
 SUFFIX = ".script.json"
@@ -63,7 +63,7 @@ class Script(DistanceAnnotator):
     ) -> None:
         super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
         self._marks = marks
-        self._dt = vector_env.spec("hopper").dt
+        self._dt = robot_named("hopper").dt
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance step by step, (W,), from the marks from control step ``demo_step`` on."""

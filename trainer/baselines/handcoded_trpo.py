@@ -107,8 +107,8 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     )
     policy = Policy(
         config.policy,
-        obs_size=env.env_spec.obs_size,
-        action_size=env.env_spec.action_size,
+        obs_size=env.robot.obs_size,
+        action_size=env.robot.action_size,
         horizon=config.horizon,
         seed=config.seed,
     ).to(config.device)

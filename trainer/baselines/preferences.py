@@ -41,6 +41,7 @@ from onedemo.errors import UserError
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector, Transitions, evaluate
 from onedemo.rl.trpo import Trpo, TrpoConfig
+from onedemo.robots.registry import robot_named
 from onedemo.sim import vector_env
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.store import Store
@@ -105,7 +106,7 @@ class PreferencesConfig:
     @property
     def segment_steps(self) -> int:
         """W."""
-        return int(self.segment_seconds / vector_env.spec("hopper").dt + 0.5)
+        return int(self.segment_seconds / robot_named("hopper").dt + 0.5)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -282,12 +283,12 @@ def draw_pairs(rollouts: Transitions, count: int, length: int, rng: np.random.Ge
     return [(first, second) for first, second in segment]
 
 
-def _make_env(config: PreferencesConfig) -> vector_env.HopperVectorEnv:
+def _make_env(config: PreferencesConfig) -> vector_env.RobotVectorEnv:
     return vector_env.make("hopper", config.lanes, horizon=config.horizon, nthread=config.threads)
 
 
 def _untrained(config: PreferencesConfig) -> Policy:
-    spec = vector_env.spec("hopper")
+    spec = robot_named("hopper")
     return Policy(
         config.policy,
         obs_size=spec.obs_size,

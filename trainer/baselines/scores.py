@@ -17,7 +17,7 @@ from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy
 from onedemo.rl.rollouts import Episodes
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.sim.task_rewards import task_reward, until_fall
 
 
@@ -63,7 +63,7 @@ def measure(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tup
         reward_max=float(totals_N.max()),
         net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
         clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
-        upright_seconds=float(upright_NT.sum(1).mean() * vector_env.spec("hopper").dt),
+        upright_seconds=float(upright_NT.sum(1).mean() * robot_named("hopper").dt),
     )
     lane = int(totals_N.argmax())
     episode = HiddenStates(

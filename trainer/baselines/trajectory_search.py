@@ -26,8 +26,8 @@ from onedemo.core.outputs import check_prefix
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
 from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
+from onedemo.robots.hopper import clearances, fallen, joint_points
 from onedemo.sim import vector_env
-from onedemo.sim.kinematics import clearances, fallen, joint_points
 from onedemo.sim.task_rewards import backflip_reward
 
 GRAVITY = 9.81
@@ -103,7 +103,7 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
     steps = round(plan.seconds / env.dt)
     qpos, qvel = [env.qpos[0]], [env.qvel[0]]
     actions: list[np.ndarray] = []
-    means = [np.zeros((plan.knots, env.env_spec.action_size))]  # before each command, for rewinds
+    means = [np.zeros((plan.knots, env.robot.action_size))]  # before each command, for rewinds
     retries = 0
     with tqdm(total=steps, unit="step", disable=not progress) as bar:
         while len(actions) < steps:
@@ -125,7 +125,7 @@ def optimise_flips(plan: FlipPlan, *, progress: bool = True) -> HiddenStates:
     env.close()
     states = np.array(qpos), np.array(qvel)
     return HiddenStates(
-        obs=vector_env.observe(env.env_spec, *states),
+        obs=env.robot.observe(*states),
         actions=np.array(actions, np.float32),
         qpos=states[0],
         qvel=states[1],
@@ -213,7 +213,7 @@ def _last_choice(plan: FlipPlan, commands: int, dt: float) -> int:
 
 def _search(
     plan: FlipPlan,
-    env: vector_env.HopperVectorEnv,
+    env: vector_env.RobotVectorEnv,
     qpos_q: np.ndarray,
     qvel_v: np.ndarray,
     step: int,
@@ -246,7 +246,7 @@ def _search(
 
 def _simulate(
     plan: FlipPlan,
-    env: vector_env.HopperVectorEnv,
+    env: vector_env.RobotVectorEnv,
     qpos_q: np.ndarray,
     qvel_v: np.ndarray,
     plans_NKa: np.ndarray,

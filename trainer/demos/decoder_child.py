@@ -96,8 +96,19 @@ def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror:
     return cv2.resize(np.ascontiguousarray(frame), size, interpolation=cv2.INTER_AREA)
 
 
+def _resident() -> Callable[[], int]:
+    """What says how many bytes of memory this process has taken; made while files can be opened."""
+    if sys.platform != "linux":
+        unit = 1 if sys.platform == "darwin" else 1024
+        return lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    # Linux counts what its parent had taken as the most that a process ever took.
+    pages, page = os.open("/proc/self/statm", os.O_RDONLY), resource.getpagesize()
+    return lambda: int(os.pread(pages, 99, 0).split()[1]) * page
+
+
 def _limit(memory: int, cpu_seconds: int) -> None:
     """Takes from this process what decoding does not need, for good."""
+    taken = _resident()
     for what, most in (
         (resource.RLIMIT_CPU, cpu_seconds),
         (resource.RLIMIT_FSIZE, 0),  # it writes no file, only into the pipe
@@ -111,13 +122,12 @@ def _limit(memory: int, cpu_seconds: int) -> None:
     try:
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     except (ValueError, OSError):  # macOS has larger things mapped than any such limit
-        threading.Thread(target=_watch_memory, args=(memory,), daemon=True).start()
+        threading.Thread(target=_watch_memory, args=(memory, taken), daemon=True).start()
 
 
-def _watch_memory(memory: int) -> None:
+def _watch_memory(memory: int, taken: Callable[[], int]) -> None:
     """Ends this process once it has taken more memory than it may."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    while resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit < memory:
+    while taken() < memory:
         time.sleep(0.02)
     os.write(2, b"MemoryError\n")
     os._exit(1)

@@ -19,7 +19,7 @@ from onedemo.reward.episode_rules import mean_rating
 from onedemo.reward.model import Snapshot
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import EpisodeRules, Episodes, evaluate
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.sim.task_rewards import backflip_reward, hop_reward, until_fall
 
 EPISODES = 16
@@ -112,7 +112,7 @@ def per_episode(episodes: Episodes, oracle: Oracle | None) -> dict[str, np.ndarr
         - ``upright_seconds``: until then.
     """
     qpos, qvel, actions = episodes.qpos, episodes.qvel, episodes.actions
-    dt = vector_env.spec("hopper").dt
+    dt = robot_named("hopper").dt
     upright = until_fall(qpos[:, 1:], qvel[:, 1:])
     hops = hop_reward(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:], actions)
     return {
@@ -165,7 +165,7 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     demo = appearance(oracle.hidden.qpos[every], oracle.hidden.qvel[every])
     robot = appearance(qpos[:, every], qvel[:, every])
     distances = np.stack([np.linalg.norm(demo[:, None] - episode, axis=-1) for episode in robot])
-    band = round(ALIGN_SECONDS / (_EVERY * vector_env.spec("hopper").dt))
+    band = round(ALIGN_SECONDS / (_EVERY * robot_named("hopper").dt))
     path = align(distances, band)
     return oracle.rating_of(np.take_along_axis(distances, path[..., None], axis=-1)[..., 0]).mean(axis=-1)
 

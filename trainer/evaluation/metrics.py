@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.sim.kinematics import CONTACT_MARGIN, clearances, fallen
+from onedemo.robots.hopper import CONTACT_MARGIN, clearances, fallen
 
 LANDED_LEAN = 0.5
 """Radians, 29 degrees: a torso no further from upright stands."""

@@ -28,7 +28,7 @@ from onedemo.render.renderer import (
     CloseUp,
     Renderer,
 )
-from onedemo.sim.kinematics import joint_points
+from onedemo.robots.hopper import joint_points
 
 _BESIDE, _ABOVE, _BELOW = 0.1, 0.12, 0.2
 """What is seen around the movers, and of the floor below them with its marks; metres."""

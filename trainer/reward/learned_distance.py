@@ -33,7 +33,8 @@ from torch.nn import functional
 from onedemo.reward.latent_track import track_of
 from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View, expected
 from onedemo.reward.segment_marks import marked_steps
-from onedemo.sim import kinematics
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import body_of
 from onedemo.storage.rating_records import RatedSegment
 
 _UPDATES = 300
@@ -46,7 +47,7 @@ _SPREAD = 0.3
 """Of the weights of an imagined track to begin with."""
 _RIDGE = 0.004
 """Of the penalty on them, a standard normal prior for about 125 ratings."""
-_PRIOR = np.repeat([-1.0, -2.0], kinematics.POSE)
+_PRIOR = (-1.0, -2.0)
 """Log weights before any rating: a difference in pose counts more than one in motion."""
 _PULL = 0.003
 """Of the penalty that holds log weights near the prior."""
@@ -70,20 +71,22 @@ class MetricSnapshot(Snapshot):
         log_weights: Of each part of the difference, (M, B).
         thresholds: Distances at which ratings 5, 4, 3 and 2 end, ascending, (M, 4).
         steepness: g of each member, (M,).
+        robot: Name of the robot.
     """
 
     def __init__(
         self, *, number: int, config: PredictorConfig, tracks: np.ndarray, log_weights: np.ndarray,
-        thresholds: np.ndarray, steepness: np.ndarray,
+        thresholds: np.ndarray, steepness: np.ndarray, robot: str = "hopper",
     ) -> None:  # fmt: skip
         super().__init__(number=number, config=config)
         self.log_weights, self.thresholds, self.steepness = log_weights, thresholds, steepness
         self._tracks = tracks
+        self._robot = robot
         self._weights = np.exp(log_weights).astype(np.float32)
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As ``Snapshot.member_probabilities``; what the motors do does not matter."""
-        robot = _body(obs)
+        robot = _body(self._robot, obs)
         if len(self._tracks) == 1:
             squares = np.square(self._tracks[0][frames] - robot) @ self._weights.T
         else:
@@ -109,7 +112,7 @@ class MetricSnapshot(Snapshot):
             return None
         return MetricSnapshot(
             number=0, config=self.config, tracks=_seen(view)[None], log_weights=self.log_weights,
-            thresholds=self.thresholds, steepness=self.steepness,
+            thresholds=self.thresholds, steepness=self.steepness, robot=self._robot,
         )  # fmt: skip
 
     def tensors(self) -> dict[str, Any]:
@@ -118,14 +121,18 @@ class MetricSnapshot(Snapshot):
             "tracks": self._tracks, "log_weights": self.log_weights,
             "thresholds": self.thresholds, "steepness": self.steepness,
         }  # fmt: skip
-        return {name: torch.from_numpy(np.asarray(array)) for name, array in arrays.items()}
+        tensors = {name: torch.from_numpy(np.asarray(array)) for name, array in arrays.items()}
+        return tensors | {"robot": self._robot}
 
 
 def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> MetricSnapshot:
     """The snapshot whose ``tensors`` are in ``data``; it computes in NumPy whatever the device."""
     names = ("tracks", "log_weights", "thresholds", "steepness")
     return MetricSnapshot(
-        number=data["number"], config=config, **{name: data[name].numpy() for name in names}
+        number=data["number"],
+        config=config,
+        robot=data.get("robot", "hopper"),
+        **{name: data[name].numpy() for name in names},
     )
 
 
@@ -168,7 +175,9 @@ def fit(
     counts = torch.bincount(classes_n, minlength=CLASSES).float()
     clips = _Clips(
         frames=torch.from_numpy(frames[:, every // 2 :: every].astype(np.int64)),
-        robot=torch.from_numpy(_body(np.stack([r.segment.obs[every // 2 :: every] for r in ratings]))),
+        robot=torch.from_numpy(
+            _body(view.robot, np.stack([r.segment.obs[every // 2 :: every] for r in ratings]))
+        ),
         classes=classes_n,
         weights=(len(ratings) / (CLASSES * counts)).clamp(_LEAST, _MOST)[classes_n],
         inside=torch.from_numpy(np.stack([marked_steps(r)[every // 2 :: every] for r in ratings])),
@@ -184,7 +193,7 @@ def fit(
     tracks, log_weights, thresholds, steepness = (np.stack(column) for column in zip(*members, strict=True))
     snapshot = MetricSnapshot(
         number=number, config=config, tracks=tracks[:1] if seen else tracks, log_weights=log_weights,
-        thresholds=thresholds, steepness=steepness,
+        thresholds=thresholds, steepness=steepness, robot=view.robot,
     )  # fmt: skip
     some = slice(None, None, -(-len(ratings) // _JUDGED_CLIPS))
     judged = [r.segment for r in ratings[some]]
@@ -213,7 +222,8 @@ def _fit_one(
     clips: _Clips, view: View, generator: torch.Generator, known: tuple[torch.Tensor, ...] | None
 ) -> tuple[tuple[np.ndarray, ...], float]:
     """One member: its track, log weights, thresholds and steepness, and the loss it ended with."""
-    prior = torch.from_numpy(_PRIOR.astype(np.float32))
+    size = body_of(robot_named(view.robot)).pose_size
+    prior = torch.tensor(_PRIOR, dtype=torch.float32).repeat_interleave(size)
     usual = prior, torch.tensor([0.9]), torch.zeros(CLASSES - 2), torch.ones(1)
     numbers = [x.clone().requires_grad_() for x in known or usual]
     log_weights, first, gaps, log_steepness = numbers
@@ -225,7 +235,9 @@ def _fit_one(
         track = torch.from_numpy(_seen(view))
         squares = (track[clips.frames] - clips.robot).square()
     else:
-        places = _SPREAD * torch.randn(basis.shape[1], kinematics.POSE, generator=generator)
+        places = _SPREAD * torch.randn(
+            basis.shape[1], body_of(robot_named(view.robot)).pose_size, generator=generator
+        )
         parameters.append(places.requires_grad_())
     optimiser = torch.optim.Adam(parameters, _RATE, fused=True)
     schedule = None
@@ -279,5 +291,6 @@ def _ascending(first: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:
     return torch.cat([first, first + functional.softplus(gaps).cumsum(0)])
 
 
-def _body(obs: np.ndarray) -> np.ndarray:
-    return np.concatenate([kinematics.pose(obs), kinematics.motion(obs)], axis=-1).astype(np.float32)
+def _body(name: str, obs: np.ndarray) -> np.ndarray:
+    body = body_of(robot_named(name))
+    return np.concatenate([body.pose(obs), body.motion(obs)], axis=-1).astype(np.float32)

@@ -4,7 +4,8 @@ Here is what all kinds have in common: settings, what they see of the demo, and 
 gives. ``trainer/reward/two_branch_net.py`` is the paper's network, ``trainer/reward/learned_distance.py``
 a learned distance.
 
-Shapes: n clips, W control steps a clip, F demo frames, D frame features, V visual dims.
+Shapes: n clips, W control steps a clip, F demo frames, D frame features, V visual dims, o observations,
+a actions.
 """
 
 from __future__ import annotations
@@ -70,6 +71,8 @@ class View:
     """Frames per second."""
     lens: Lens | None = None
     """How ``visual`` was made of the features; needed if another run is to start from the predictor."""
+    robot: str = "hopper"
+    """Whose states are compared with it."""
 
 
 class Snapshot(ABC):
@@ -93,8 +96,8 @@ class Snapshot(ABC):
 
         Args:
             frames: Index of the demo frame shown, integers of any shape.
-            obs: Observations of the robot, (..., 11).
-            actions: Its actions, (..., 3). Frames and states are broadcast against each other.
+            obs: Observations of the robot, (..., o).
+            actions: Its actions, (..., a). Frames and states are broadcast against each other.
 
         Returns:
             (members, ..., 5), float32, for ratings 1 to 5.
@@ -137,8 +140,8 @@ class Snapshot(ABC):
 
         Args:
             frames: (n, W).
-            obs: (n, W, 11).
-            actions: (n, W, 3).
+            obs: (n, W, o).
+            actions: (n, W, a).
 
         Returns:
             Mean over members, and standard deviation among them, (n,) each.

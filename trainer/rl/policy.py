@@ -52,12 +52,14 @@ class PolicySnapshot:
     """Of the features, (f,), float64."""
     time: np.ndarray | None
     """Normalised inputs of each demo step, float32: they depend on nothing else. None without time."""
+    angles: tuple[int, ...] = (1,)
+    """Which observations are angles without end."""
     network: nn.Module | None = None
     """The network of the mean, a copy on an accelerator, which then acts; None: the weights above do."""
 
     def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
         """Normalised policy inputs of observations (..., o) at demo steps (...): (..., f), float32."""
-        features = state_features(obs, self.kind)
+        features = state_features(obs, self.kind, self.angles)
         width = features.shape[-1]
         state = _normalise(features, self.mean[:width], self.std[:width])
         if self.time is None:
@@ -128,6 +130,7 @@ class Policy(nn.Module):
         horizon: Demo steps in an episode.
         seed: Of the initial weights.
         table: For kind "table", (H, k).
+        angles: Which observations are angles without end, ascending.
     """
 
     def __init__(
@@ -139,17 +142,19 @@ class Policy(nn.Module):
         horizon: int,
         seed: int,
         table: np.ndarray | None = None,
+        angles: Sequence[int] = (1,),
     ) -> None:
         super().__init__()
         self.config = config
         self.obs_size = obs_size
         self.action_size = action_size
         self.horizon = horizon
+        self.angles = tuple(angles)
         if (config.kind == "table") != (table is not None):
             raise ValueError('a table is needed by kind "table" and by no other')
         width = 0 if table is None else table.shape[1]
         self.table = None if table is None else np.array(table, np.float64)
-        self.input_size = feature_size(obs_size, config.kind, width)
+        self.input_size = feature_size(obs_size, config.kind, width, len(self.angles))
         # A small last layer: the first policy is its noise, whatever the inputs.
         self.mean = mlp((self.input_size, *config.hidden, action_size), 0.01, seed)
         self.log_std = nn.Parameter(torch.full((action_size,), config.log_std))
@@ -171,7 +176,7 @@ class Policy(nn.Module):
     def observe(self, obs: np.ndarray, clock: np.ndarray) -> None:
         """Takes observations (..., o) at demo steps (...) into the running normaliser."""
         kind, horizon = self.config.kind, self.horizon
-        self.normaliser.update(policy_inputs(obs, clock, horizon, kind, self.table))
+        self.normaliser.update(policy_inputs(obs, clock, horizon, kind, self.table, angles=self.angles))
 
     @property
     def device(self) -> torch.device:
@@ -201,6 +206,7 @@ class Policy(nn.Module):
             mean=mean,
             std=std,
             time=time,
+            angles=self.angles,
             network=copy.deepcopy(self.mean).requires_grad_(False) if on_device else None,
         )
 
@@ -212,6 +218,7 @@ class Policy(nn.Module):
             "obs_size": self.obs_size,
             "action_size": self.action_size,
             "horizon": self.horizon,
+            "angles": list(self.angles),
             "table": None if self.table is None else torch.from_numpy(self.table.copy()),
             "state": {name: value.detach().cpu().clone() for name, value in self.state_dict().items()},
         }
@@ -226,6 +233,7 @@ class Policy(nn.Module):
             horizon=saved["horizon"],
             seed=0,
             table=None if saved["table"] is None else saved["table"].numpy(),
+            angles=saved.get("angles", (1,)),
         )
         policy.load_state_dict(saved["state"])
         return policy

@@ -5,6 +5,8 @@ Shapes: "..." any batch shape, o observations, f features, H demo steps (horizon
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from onedemo.rl.settings import KINDS
@@ -18,15 +20,18 @@ def policy_inputs(
     horizon: int,
     kind: str,
     table: np.ndarray | None = None,
+    *,
+    angles: Sequence[int] = (1,),
 ) -> np.ndarray:
     """Features of a state and a demo time, not normalised.
 
     Args:
-        obs: Observations, (..., o); index 1 is the torso angle in radians.
+        obs: Observations, (..., o).
         clock: Demo step of each, (...), 0 to horizon; later counts as horizon.
         horizon: Demo steps in an episode.
         kind: One of ``KINDS``.
         table: For "table": what to show at each demo step, (H, k).
+        angles: Which observations are angles without end, ascending.
 
     Returns:
         Features, (..., f), float64: those of the state, then those of the time.
@@ -36,29 +41,34 @@ def policy_inputs(
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
-    state, time = state_features(obs, kind), time_features(horizon, kind, table)
+    state, time = state_features(obs, kind, angles), time_features(horizon, kind, table)
     if time is None:
         return state
     return np.concatenate([state, time[rows_of(clock, time)]], axis=-1)
 
 
-def state_features(obs: np.ndarray, kind: str) -> np.ndarray:
+def state_features(obs: np.ndarray, kind: str, angles: Sequence[int] = (1,)) -> np.ndarray:
     """Features of a state alone.
 
-    The torso angle is unbounded (it counts turns), so every kind but "raw" shows it as sine and
-    cosine: the second flip then looks like the first.
+    An angle without end counts turns, so every kind but "raw" shows it as sine and cosine: the second
+    flip then looks like the first.
 
     Args:
         obs: Observations, (..., o).
         kind: One of ``KINDS``.
+        angles: Which observations are angles without end, ascending: of a hopper the torso's.
 
     Returns:
-        (..., o) for "raw", else (..., o + 1), float64.
+        (..., o) for "raw", else a number more for each of the angles, float64.
     """
     if kind == "raw":
         return np.asarray(obs, np.float64)
-    angle = obs[..., 1:2]
-    return np.concatenate([obs[..., :1], np.sin(angle), np.cos(angle), obs[..., 2:]], axis=-1)
+    pieces, after = [], 0
+    for at in angles:
+        angle = obs[..., at : at + 1]
+        pieces += [obs[..., after:at], np.sin(angle), np.cos(angle)]
+        after = at + 1
+    return np.concatenate([*pieces, obs[..., after:]], axis=-1)
 
 
 def time_features(horizon: int, kind: str, table: np.ndarray | None = None) -> np.ndarray | None:
@@ -81,7 +91,12 @@ def rows_of(clock: np.ndarray, time: np.ndarray) -> np.ndarray:
     return np.clip(clock, 0, len(time) - 1)
 
 
-def feature_size(obs_size: int, kind: str, table_width: int = 0) -> int:
+def feature_size(obs_size: int, kind: str, table_width: int = 0, angles: int = 1) -> int:
     """How many features ``policy_inputs`` gives."""
-    extra = {"clock": 2 + 2 * len(HARMONICS), "table": 1 + table_width, "pose": 1, "raw": 0}
+    extra = {
+        "clock": angles + 1 + 2 * len(HARMONICS),
+        "table": angles + table_width,
+        "pose": angles,
+        "raw": 0,
+    }
     return obs_size + extra[kind]

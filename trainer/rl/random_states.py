@@ -3,47 +3,91 @@
 A random policy from a standing start never shows a flip, so no rating could ever say that a flip is
 right. Random states of the robot, let go for a second, show a bit of everything that it can do.
 
-Shapes: n states, N lanes, T control steps, q = v = 6 positions and velocities.
+Shapes: n states, N lanes, T control steps, q positions, v velocities, a actions.
 """
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
 from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, Transitions
+from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot, model_of
 from onedemo.sim import vector_env
-from onedemo.sim.kinematics import clearances
+from onedemo.sim.kinematics import body_of
 
-_JOINTS = np.array([[-2.6, 0.05], [-2.6, 0.05], [-0.78, 0.78]])
-"""Range of thigh, leg and foot, radians: that of the model's joints (hopper.xml), whose stops are soft."""
-_HEIGHTS = (0.05, 1.9)
-"""Metres, of the torso's centre."""
-_SPREADS = np.array([1.5, 2.0, 6.0, 4.0, 4.0, 4.0])
-"""Standard deviation of each velocity, m/s and rad/s."""
 _SUNK = 0.05
 """Metres that a part may reach into the ground: contacts push it out within a few steps."""
+_SLIDE_SPEED, _TURN_SPEED = 2.0, 4.0
+"""Standard deviations of velocities where the robot does not say, m/s and rad/s."""
 
 
-def random_states(count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """States spread over what the robot can be in: any torso angle, spin and height above the ground.
+def random_states(
+    count: int, rng: np.random.Generator, name: str = "hopper"
+) -> tuple[np.ndarray, np.ndarray]:
+    """States spread over what the robot can be in: any angle, spin and height above the ground.
 
     Args:
         count: n.
         rng: Draws them.
+        name: The robot.
 
     Returns:
-        Positions (n, q), x = 0, and velocities (n, v).
+        Positions (n, q), where the place on the floor is 0, and velocities (n, v).
     """
-    kept = [np.zeros((0, 6))]
+    of = robot_named(name)
+    kept = [np.zeros((0, of.positions))]
     while sum(map(len, kept)) < count:
-        qpos = np.zeros((2 * count, 6))
-        qpos[:, 1] = rng.uniform(*_HEIGHTS, len(qpos))
-        qpos[:, 2] = rng.uniform(-np.pi, np.pi, len(qpos))
-        qpos[:, 3:] = rng.uniform(_JOINTS[:, 0], _JOINTS[:, 1], (len(qpos), 3))
-        lowest = np.minimum.reduce(list(clearances(qpos).values()))
+        qpos = _positions(of, 2 * count, rng)
+        if of.root == "fixed" or of.camera.up != 2:
+            kept.append(qpos)  # there is no ground to reach
+            continue
+        lowest = np.minimum.reduce(list(body_of(of).clearances(qpos).values()))
         kept.append(qpos[lowest > -_SUNK])
     qpos = np.concatenate(kept)[:count]
-    return qpos, rng.normal(0.0, _SPREADS, (count, len(_SPREADS)))
+    return qpos, rng.normal(0.0, _speeds(of), (count, of.velocities))
+
+
+def _positions(of: Robot, count: int, rng: np.random.Generator) -> np.ndarray:
+    model = model_of(of.xml)
+    qpos = np.tile(model.qpos0, (count, 1))
+    first = {"planar": 3, "free": 7, "fixed": 0}[of.root]
+    if of.root != "fixed":
+        qpos[:, : of.unseen] = 0
+        qpos[:, of.height] = rng.uniform(*of.wild.heights, count)
+    if of.root == "planar":
+        qpos[:, 2] = rng.uniform(-np.pi, np.pi, count)
+    elif of.root == "free":
+        turned = rng.standard_normal((count, 4))
+        qpos[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    if of.wild.joints is not None:
+        ranges = np.array(of.wild.joints)
+        qpos[:, first:] = rng.uniform(ranges[:, 0], ranges[:, 1], (count, len(ranges)))
+        return qpos
+    for joint in np.flatnonzero(model.jnt_qposadr >= first):
+        at, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            turned = rng.standard_normal((count, 4))
+            qpos[:, at : at + 4] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        elif kind != mujoco.mjtJoint.mjJNT_FREE:
+            low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.pi, np.pi)
+            qpos[:, at] = rng.uniform(low, high, count)
+    return qpos
+
+
+def _speeds(of: Robot) -> np.ndarray:
+    if of.wild.speeds is not None:
+        return np.array(of.wild.speeds)
+    model = model_of(of.xml)
+    speeds = np.full(of.velocities, _TURN_SPEED)
+    for joint in range(model.njnt):
+        at = model.jnt_dofadr[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            speeds[at : at + 3] = _SLIDE_SPEED
+        elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
+            speeds[at] = _SLIDE_SPEED
+    return speeds
 
 
 class RandomStarts(EpisodeRules):
@@ -51,15 +95,16 @@ class RandomStarts(EpisodeRules):
 
     Args:
         standing: Share of lanes that start standing all the same.
+        name: The robot.
     """
 
-    def __init__(self, standing: float = 0.0) -> None:
-        self._standing = standing
+    def __init__(self, standing: float = 0.0, name: str = "hopper") -> None:
+        self._standing, self._name = standing, name
 
     def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:
         """Random states at demo step 0."""
         lanes = lanes[rng.random(len(lanes)) >= self._standing]
-        qpos, qvel = random_states(len(lanes), rng)
+        qpos, qvel = random_states(len(lanes), rng, self._name)
         return Starts(lanes=lanes, qpos=qpos, qvel=qvel, clock=np.zeros(len(lanes), np.int32))
 
 
@@ -68,15 +113,16 @@ class HeldNoise:
 
     Args:
         lanes: N.
+        actions: a.
         hold: Control steps that an action is held, at most.
     """
 
     mean = np.zeros(1)
 
-    def __init__(self, lanes: int, hold: int = 10) -> None:
+    def __init__(self, lanes: int, actions: int, hold: int = 10) -> None:
         self._hold = hold
         self._left = np.zeros(lanes, int)
-        self._actions = np.zeros((lanes, 3), np.float32)
+        self._actions = np.zeros((lanes, actions), np.float32)
 
     def inputs(self, obs: np.ndarray, clock: np.ndarray) -> np.ndarray:
         """Nothing: (N, 1)."""
@@ -86,7 +132,9 @@ class HeldNoise:
         """Actions, (N, a); those whose time is over are drawn anew."""
         assert rng is not None, "noise needs a generator"
         over = self._left <= 0
-        self._actions[over] = rng.standard_normal((int(over.sum()), 3), np.float32).clip(-1, 1)
+        self._actions[over] = rng.standard_normal((int(over.sum()), self._actions.shape[1]), np.float32).clip(
+            -1, 1
+        )
         self._left[over] = rng.integers(1, self._hold + 1, int(over.sum()))
         self._left -= 1
         return self._actions.copy()
@@ -117,7 +165,7 @@ def wild_rollouts(
         The rollouts; ``clock`` counts from each random start.
     """
     env = vector_env.make(env_name, lanes, horizon=every, nthread=nthread)
-    collector = Collector(env, seed=seed, rules=RandomStarts(standing), stagger=False)
-    rollouts = collector.collect(HeldNoise(lanes), steps)
+    collector = Collector(env, seed=seed, rules=RandomStarts(standing, env_name), stagger=False)
+    rollouts = collector.collect(HeldNoise(lanes, env.robot.action_size), steps)
     env.close()
     return rollouts

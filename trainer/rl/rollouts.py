@@ -156,7 +156,7 @@ class Collector:
 
     def __init__(
         self,
-        env: vector_env.HopperVectorEnv,
+        env: vector_env.RobotVectorEnv,
         *,
         seed: int,
         rules: EpisodeRules | None = None,
@@ -180,7 +180,7 @@ class Collector:
         Returns:
             What happened, lane-first.
         """
-        env, size = self.env, self.env.env_spec
+        env, size = self.env, self.env.robot
         rng = None if deterministic else self._rng
 
         def room(rows: int, *width: int, dtype: Any = np.float64) -> np.ndarray:
@@ -284,7 +284,7 @@ class Collector:
 
 
 def take_step(
-    env: vector_env.HopperVectorEnv,
+    env: vector_env.RobotVectorEnv,
     obs: np.ndarray,
     clock: np.ndarray,
     actions: np.ndarray,
@@ -344,7 +344,7 @@ class Acting:
     """Move the demo phase; their starts and early ends are not used."""
 
     def step(
-        self, env: vector_env.HopperVectorEnv, obs: np.ndarray, clock: np.ndarray
+        self, env: vector_env.RobotVectorEnv, obs: np.ndarray, clock: np.ndarray
     ) -> tuple[Step, np.ndarray]:
         """One control step of all lanes by the policy's mean action, and the demo step after it, (N,).
 

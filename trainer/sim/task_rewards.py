@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 
 
 def backflip_reward(next_obs: np.ndarray, actions: np.ndarray, *, clip_actions: bool = True) -> np.ndarray:
@@ -51,10 +51,10 @@ def hop_reward(
     Returns:
         Reward per step, (...).
     """
-    hopper = vector_env.spec("hopper")
+    hopper = robot_named("hopper")
     forward = (next_qpos[..., 0] - qpos[..., 0]) / hopper.dt
-    upright = hopper.healthy_reward * vector_env.healthy(hopper, next_qpos, next_qvel)
-    return forward + upright - hopper.control_cost * np.square(actions).sum(-1)
+    upright = hopper.stock.healthy * hopper.healthy(next_qpos, next_qvel)
+    return forward + upright - hopper.stock.control * np.square(actions).sum(-1)
 
 
 def until_fall(next_qpos: np.ndarray, next_qvel: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def until_fall(next_qpos: np.ndarray, next_qvel: np.ndarray) -> np.ndarray:
     Returns:
         True up to the first fall, (..., T). The stock return is the sum of the rewards there.
     """
-    upright = vector_env.healthy(vector_env.spec("hopper"), next_qpos, next_qvel)
+    upright = robot_named("hopper").healthy(next_qpos, next_qvel)
     before = np.concatenate([np.ones_like(upright[..., :1]), upright[..., :-1]], axis=-1)
     return np.logical_and.accumulate(before, axis=-1)
 

@@ -10,8 +10,6 @@ Shapes: N lanes, o observations, a actions, q = v positions and velocities, S = 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -21,84 +19,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from onedemo.core.cpu import cores
-from onedemo.errors import UserError
+from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot
 from onedemo.sim.physics import load_model, make_physics
 
-_ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 _FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class EnvSpec:
-    """One environment: a planar robot whose first coordinates are x, z and the torso angle.
-
-    Defaults are those of gymnasium's Hopper-v5.
-    """
-
-    name: str
-    xml: Path
-    """The MuJoCo model."""
-    obs_size: int
-    """Observations: ``qpos[1:]`` and the clipped ``qvel``."""
-    action_size: int
-    """Motors, each driven in -1..1 (the model clamps)."""
-    timestep: float
-    """Physics step, seconds (the model's own)."""
-    frame_skip: int
-    """Physics steps in a control step."""
-    horizon: int
-    """Control steps in an episode unless asked otherwise."""
-    camera: str
-    """Camera that follows the robot."""
-    velocity_limit: float = 10.0
-    """Observed velocities are clipped to +- this, m/s and rad/s."""
-    reset_noise: float = 5e-3
-    """Half-width of the uniform noise on every position and velocity at a reset."""
-    healthy_reward: float = 1.0
-    """Reward of a step that ends healthy."""
-    control_cost: float = 1e-3
-    """Cost of the squared action, per step."""
-    healthy_z: tuple[float, float] = (0.7, np.inf)
-    """Open range of torso heights that count as healthy, metres."""
-    healthy_angle: tuple[float, float] = (-0.2, 0.2)
-    """Open range of torso angles that count as healthy, radians."""
-    healthy_state: float = 100.0
-    """Healthy: every other position and velocity is within +- this."""
-
-    def __post_init__(self) -> None:
-        if self.frame_skip < 1 or self.horizon < 1 or self.timestep <= 0:
-            raise ValueError(f"{self.name}: frame_skip, horizon and timestep must be positive")
-
-    @property
-    def dt(self) -> float:
-        """Control step, seconds."""
-        return self.timestep * self.frame_skip
-
-
-SPECS = {
-    "hopper": EnvSpec(
-        name="hopper",
-        xml=_ASSETS / "hopper.xml",
-        obs_size=11,
-        action_size=3,
-        timestep=0.002,
-        frame_skip=4,
-        horizon=1000,
-        camera="track",
-    ),
-}
-"""Every environment onedemo knows. To add one, add an entry."""
-
-
-def spec(name: str) -> EnvSpec:
-    """The environment of that name.
-
-    Raises:
-        UserError: If there is none; the message lists those there are.
-    """
-    if name not in SPECS:
-        raise UserError(f"unknown environment {name!r}; choose one of: {', '.join(sorted(SPECS))}")
-    return SPECS[name]
 
 
 def make(
@@ -109,16 +34,16 @@ def make(
     nthread: int | None = None,
     physics: str = "mujoco",
     terminate_when_unhealthy: bool = False,
-) -> HopperVectorEnv:
-    """Makes N lanes of a registered environment. Options as for ``HopperVectorEnv``.
+) -> RobotVectorEnv:
+    """Makes N lanes of the robot of that name. Options as for ``RobotVectorEnv``.
 
     Raises:
-        UserError: If the environment is unknown, or the physics is not installed.
+        UserError: If the robot is unknown, or the physics is not installed.
         ValueError: If an option is out of range.
     """
-    return HopperVectorEnv(
+    return RobotVectorEnv(
+        robot_named(name),
         num_envs,
-        env_spec=spec(name),
         horizon=horizon,
         nthread=nthread,
         physics=physics,
@@ -126,56 +51,22 @@ def make(
     )
 
 
-def observe(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """The observation of states: everything but x, velocities clipped.
+class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """N lanes of a robot: its observations and gymnasium's reward, episodes of fixed length.
 
-    Args:
-        env_spec: The environment.
-        qpos: Positions, (..., q), metres and radians.
-        qvel: Velocities, (..., v), metres/s and radians/s.
-
-    Returns:
-        Observations, (..., o).
-    """
-    limit = env_spec.velocity_limit
-    return np.concatenate([qpos[..., 1:], np.clip(qvel, -limit, limit)], axis=-1)
-
-
-def healthy(env_spec: EnvSpec, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Whether states are upright by the rule of gymnasium's Hopper-v5.
-
-    Args:
-        env_spec: The environment.
-        qpos: Positions, (..., q).
-        qvel: Velocities, (..., v).
-
-    Returns:
-        True where healthy, (...).
-    """
-    low_z, high_z = env_spec.healthy_z
-    low_angle, high_angle = env_spec.healthy_angle
-    z, angle = qpos[..., 1], qpos[..., 2]
-    limit = env_spec.healthy_state
-    inside = np.maximum(np.abs(qpos[..., 2:]).max(-1), np.abs(qvel).max(-1)) < limit
-    return inside & (low_z < z) & (z < high_z) & (low_angle < angle) & (angle < high_angle)
-
-
-class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """N lanes of a planar robot: Hopper-v5's observations and rewards, episodes of fixed length.
-
-    Falling does not end an episode: the stock limit of 0.2 rad would end any flip. Lanes that end
+    Falling does not end an episode: the stock limit of a hopper's lean would end any flip. Lanes that end
     restart within the same step (``AutoresetMode.SAME_STEP``); ``infos`` then holds ``final_obs``,
     ``final_qpos`` and ``final_qvel`` of all lanes as they were before the restart, each with the
     mask ``_final_...`` of the lanes that ended.
 
     Args:
+        robot: The robot.
         num_envs: Lanes.
-        env_spec: The environment; Hopper if not given.
-        horizon: Control steps in an episode; the environment's own if None.
+        horizon: Control steps in an episode; the robot's own if None.
         nthread: Physics threads; as many as this process may use if None, none beside the
             caller's if 0. Of "mujoco" only.
         physics: "mujoco", on the processor's cores, or "warp", on a GPU (``trainer/sim/warp_physics.py``).
-        terminate_when_unhealthy: End an episode on a fall, as Hopper-v5 does (for baselines).
+        terminate_when_unhealthy: End an episode on a fall, as gymnasium does (for baselines).
 
     Raises:
         ValueError: If an option is out of range.
@@ -184,18 +75,18 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __init__(
         self,
+        robot: Robot,
         num_envs: int,
         *,
-        env_spec: EnvSpec | None = None,
         horizon: int | None = None,
         nthread: int | None = None,
         physics: str = "mujoco",
         terminate_when_unhealthy: bool = False,
     ) -> None:
-        self.env_spec = env_spec or SPECS["hopper"]
+        self.robot = robot
         self.num_envs = num_envs
-        self.horizon = self.env_spec.horizon if horizon is None else horizon
-        self.dt = self.env_spec.dt
+        self.horizon = robot.horizon if horizon is None else horizon
+        self.dt = robot.dt
         self.terminate_when_unhealthy = terminate_when_unhealthy
         if nthread is None:
             nthread = min(cores(), num_envs)
@@ -209,19 +100,25 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             "autoreset_mode": AutoresetMode.SAME_STEP,
             "render_fps": round(1 / self.dt),
         }
-        self.model = load_model(self.env_spec.xml)
-        self._physics = make_physics(physics, self.model, self.env_spec.frame_skip, num_envs, nthread)
+        self.model = load_model(robot.xml)
+        self._physics = make_physics(physics, self.model, robot.frame_skip, num_envs, nthread)
         self._initial = np.empty(mujoco.mj_stateSize(self.model, _FULL))
         mujoco.mj_getState(self.model, mujoco.MjData(self.model), self._initial, _FULL)
         self._state = np.tile(self._initial, (num_envs, 1))
         self._positions = slice(1, 1 + self.model.nq)
-        self._velocities = slice(1 + self.model.nq, None)
+        self._velocities = slice(1 + self.model.nq, 1 + self.model.nq + self.model.nv)
+        low, high = np.array(robot.low), np.array(robot.high)
+        # Where an action is the command, and the motors clamp it, there is nothing to do.
+        self._as_commanded = bool(
+            (low == -1).all() and (high == 1).all() and self.model.actuator_ctrllimited.all()
+        )
+        self._middle, self._reach = (low + high) / 2, (high - low) / 2
         self.elapsed = np.zeros(num_envs, np.int32)
         """Control steps since each lane's episode began, (N,)."""
         self._limit = np.full(num_envs, self.horizon, np.int32)
         inf, one = np.inf, np.float32(1)
-        self.single_observation_space = gymnasium.spaces.Box(-inf, inf, (self.env_spec.obs_size,), np.float64)
-        self.single_action_space = gymnasium.spaces.Box(-one, one, (self.env_spec.action_size,), np.float32)
+        self.single_observation_space = gymnasium.spaces.Box(-inf, inf, (robot.obs_size,), np.float64)
+        self.single_action_space = gymnasium.spaces.Box(-one, one, (robot.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
@@ -238,14 +135,14 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def obs(self) -> np.ndarray:
         """Observations now, (N, o)."""
-        return observe(self.env_spec, self._state[:, self._positions], self._state[:, self._velocities])
+        return self.robot.observe(self._state[:, self._positions], self._state[:, self._velocities])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts new episodes from the standard reset.
 
-        One lane with a seed starts exactly where gymnasium's Hopper-v5 starts with that seed.
+        One lane with a seed starts exactly where gymnasium's environment starts with that seed.
 
         Args:
             seed: Seeds the one generator of all lanes.
@@ -281,27 +178,28 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One control step of every lane.
 
         Args:
-            actions: (N, a). The motors clamp them to -1..1; the control cost does not, as in
+            actions: (N, a), in -1..1. What lies beyond is clamped by the motors, but costs, as in
                 gymnasium.
 
         Returns:
-            Observations (N, o), rewards of Hopper-v5 (N,), terminated (N,), truncated (N,), infos.
+            Observations (N, o), gymnasium's rewards (N,), terminated (N,), truncated (N,), infos.
 
         Raises:
             ValueError: If the actions have the wrong shape.
         """
         actions = np.asarray(actions, np.float64)
-        if actions.shape != (self.num_envs, self.env_spec.action_size):
+        if actions.shape != (self.num_envs, self.robot.action_size):
             raise ValueError(f"actions must be {self.action_space.shape}, got {actions.shape}")
+        commands = actions if self._as_commanded else self._middle + self._reach * actions.clip(-1, 1)
         x_before = self._state[:, 1]
-        self._state = self._physics.step(self._state, actions)
+        self._state = self._physics.step(self._state, commands)
         self.elapsed += 1
         qpos, qvel = self._state[:, self._positions], self._state[:, self._velocities]
-        upright = healthy(self.env_spec, qpos, qvel)
+        stock, upright = self.robot.stock, self.robot.healthy(qpos, qvel)
         rewards = (
-            (self._state[:, 1] - x_before) / self.dt
-            + self.env_spec.healthy_reward * upright
-            - self.env_spec.control_cost * np.square(actions).sum(-1)
+            stock.forward * (self._state[:, 1] - x_before) / self.dt
+            + stock.healthy * upright
+            - stock.control * np.square(commands).sum(-1)
         )
         terminated = ~upright if self.terminate_when_unhealthy else np.zeros(self.num_envs, bool)
         truncated = (self.elapsed >= self._limit) & ~terminated
@@ -333,12 +231,14 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         lanes = np.asarray(lanes, np.intp)
         state = np.concatenate([np.atleast_2d(qpos), np.atleast_2d(qvel)], axis=1)
-        if state.shape != (len(lanes), self._initial.size - 1) or not np.isfinite(state).all():
+        width = self.robot.positions + self.robot.velocities
+        if state.shape != (len(lanes), width) or not np.isfinite(state).all():
             raise ValueError(
                 f"{len(lanes)} lanes need finite positions and velocities, "
-                f"({len(lanes)}, {self._initial.size - 1}) together, got {state.shape}"
+                f"({len(lanes)}, {width}) together, got {state.shape}"
             )
-        self._state[lanes, 1:] = state
+        self._state[lanes, 1 : 1 + width] = state
+        self._state[lanes, 1 + width :] = self._initial[1 + width :]  # what the motors remember
         if elapsed is not None:
             self.elapsed[lanes] = elapsed
 
@@ -370,9 +270,17 @@ class HopperVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._physics.close()
 
     def _restart(self, lanes: np.ndarray) -> None:
-        noise = self.env_spec.reset_noise
-        size = (len(lanes), self._initial.size - 1)
+        noise, robot = self.robot.start, self.robot
         self._state[lanes] = self._initial
-        self._state[lanes, 1:] += self.np_random.uniform(-noise, noise, size)
+        shape = (len(lanes), robot.positions + robot.velocities)
+        if noise.normal:
+            spread = np.concatenate([
+                self.np_random.uniform(-noise.positions, noise.positions, (len(lanes), robot.positions)),
+                noise.velocities * self.np_random.standard_normal((len(lanes), robot.velocities)),
+            ], axis=1)  # fmt: skip
+        else:
+            ends = np.repeat([noise.positions, noise.velocities], [robot.positions, robot.velocities])
+            spread = self.np_random.uniform(-ends, ends, shape)
+        self._state[lanes, 1 : 1 + shape[1]] += spread
         self.elapsed[lanes] = 0
         self._limit[lanes] = self.horizon

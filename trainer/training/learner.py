@@ -36,7 +36,9 @@ from onedemo.rl.policy import Policy, PolicySnapshot, check_device
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.rl.rollouts import Collector, EpisodeRules, Transitions
 from onedemo.rl.trpo import Trpo
-from onedemo.sim import kinematics, vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.sim import vector_env
+from onedemo.sim.kinematics import body_of
 from onedemo.storage.rating_records import RatedSegment
 from onedemo.types import Rollouts, Segment
 from onedemo.vision.pose_estimator import Track
@@ -48,8 +50,6 @@ _AHEAD_SECONDS = (0.0, 0.13, 0.33)
 """The policy sees the demo as it is now and so far ahead (policy.kind = "table")."""
 _JUDGED_EVERY = 4
 """Control steps between those that are looked at to choose a clip."""
-_TABLE_DIMS = 2 * kinematics.POSE
-"""Numbers of each of them: pose and motion where they are known, else principal components."""
 _LOOKED_AT = 500
 """States of an iteration about which the members are asked."""
 _DEVICE_LANES = 1024
@@ -71,10 +71,11 @@ class Learner:
     """
 
     def __init__(self, config: RunConfig, frames: int, fps: float, start: Snapshot | None = None) -> None:
-        spec = vector_env.spec(config.env)
+        self.robot = robot_named(config.env)
         check_device(config.device)
         self.config = config
-        self.dt = spec.dt
+        self.dt = self.robot.dt
+        self._table_dims = 2 * body_of(self.robot).pose_size
         self.demo_steps, self.clip_steps = lengths(config, frames, fps)
         self.iteration = 0
         self.env_steps = 0
@@ -84,7 +85,7 @@ class Learner:
         self._start = start
         self._first: Snapshot | None = None  # the start beside this demo
         self._fps = fps
-        self._frames = frame_of_step(np.arange(self.demo_steps), spec.dt, fps, frames)
+        self._frames = frame_of_step(np.arange(self.demo_steps), self.dt, fps, frames)
         self._policy = self._make_policy().to(config.device)
         self._trpo = Trpo(self._policy, config.trpo, seed=config.seed, threads=config.rollouts.threads)
         self._acts_on_device = config.device != "cpu" and config.rollouts.lanes >= _DEVICE_LANES
@@ -113,6 +114,7 @@ class Learner:
             basis=track_basis(features, self._fps),
             fps=self._fps,
             lens=lens,
+            robot=self.config.env,
         )
         if self._start is not None:
             check_start(self._start, self.config.predictor)
@@ -121,8 +123,8 @@ class Learner:
             if track is not None:
                 shown = np.concatenate([track.pose, track.motion], axis=-1)
             else:
-                shown = visual_inputs(features, _TABLE_DIMS)
-                shown = np.pad(shown, ((0, 0), (0, _TABLE_DIMS - shown.shape[1])))
+                shown = visual_inputs(features, self._table_dims)
+                shown = np.pad(shown, ((0, 0), (0, self._table_dims - shown.shape[1])))
             self._policy.table = self._ahead(shown)
 
     @property
@@ -335,13 +337,13 @@ class Learner:
         return self._wild
 
     def _make_policy(self) -> Policy:
-        spec, config = vector_env.spec(self.config.env), self.config.policy
+        robot, config = self.robot, self.config.policy
         table = None
         if config.kind == "table":  # filled in ``look_at``
-            table = np.zeros((self.demo_steps, len(_AHEAD_SECONDS) * _TABLE_DIMS))
+            table = np.zeros((self.demo_steps, len(_AHEAD_SECONDS) * self._table_dims))
         return Policy(
-            config, obs_size=spec.obs_size, action_size=spec.action_size, horizon=self.demo_steps,
-            seed=self.config.seed, table=table,
+            config, obs_size=robot.obs_size, action_size=robot.action_size, horizon=self.demo_steps,
+            seed=self.config.seed, table=table, angles=robot.angles,
         )  # fmt: skip
 
     def _ahead(self, shown: np.ndarray) -> np.ndarray:
@@ -388,7 +390,7 @@ def lengths(config: RunConfig, frames: int, fps: float) -> tuple[int, int]:
     Raises:
         UserError: If the robot is unknown or the demo is shorter than a clip.
     """
-    dt = vector_env.spec(config.env).dt
+    dt = robot_named(config.env).dt
     demo, clip = int(frames / fps / dt + 1e-6), int(config.ratings.clip_seconds / dt + 0.5)
     if demo < clip:
         raise UserError(

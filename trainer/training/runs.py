@@ -13,7 +13,7 @@ from onedemo.config import RunConfig, load_config, to_toml
 from onedemo.core.files import write_atomic
 from onedemo.core.names import check_name, check_new_name
 from onedemo.errors import UserError
-from onedemo.sim.vector_env import spec
+from onedemo.robots.registry import robot_named
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.training.learner import lengths
@@ -135,7 +135,7 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         seed=config.seed,
         config=text,
         version=program_version(),
-        step_seconds=spec(config.env).dt,
+        step_seconds=robot_named(config.env).dt,
     )
     write_atomic(RunDirectory(data_dir, name).config, text.encode())
     return name

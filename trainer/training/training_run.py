@@ -28,7 +28,7 @@ from onedemo.reward.model import Snapshot
 from onedemo.reward.warm_start import keep_start
 from onedemo.rl.policy import PolicySnapshot
 from onedemo.rl.rollouts import Acting, EpisodeRules, Transitions
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.sim.task_rewards import TASK_REWARDS
 from onedemo.storage.rating_records import RatedSegment
 from onedemo.storage.run_directory import RunDirectory
@@ -102,7 +102,7 @@ class TrainingRun:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
         self.files = RunDirectory(data_dir, run)
-        self.dt = vector_env.spec(config.env).dt
+        self.dt = robot_named(config.env).dt
         """Seconds of a control step."""
         self.queue = RatingQueue(store, run, config, simulated)
         """The clips that are put to annotators."""

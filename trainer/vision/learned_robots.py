@@ -16,14 +16,14 @@ import numpy as np
 from onedemo import static
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.core.names import check_name
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 
 SHIPPED = Path(static.__file__).parent / "robots"
 
 
 def model_name(env_name: str) -> str:
     """Names a robot and its model."""
-    model = hashlib.sha256(vector_env.spec(env_name).xml.read_bytes()).hexdigest()[:12]
+    model = hashlib.sha256(robot_named(env_name).xml.read_bytes()).hexdigest()[:12]
     return f"{check_name(env_name)}-{model}"
 
 

@@ -23,7 +23,8 @@ from torch.nn import functional
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
-from onedemo.sim import kinematics
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import HEIGHT_SCALE, body_of
 from onedemo.types import Demo
 from onedemo.vision import learned_robots
 from onedemo.vision.encoders import Encoder
@@ -96,13 +97,14 @@ class PoseEstimator:
             fps: Frames per second.
         """
         poses = self.poses(features)
-        height = _smooth(poses[:, 0] / kinematics.HEIGHT_SCALE)
+        height = _smooth(poses[:, 0] / HEIGHT_SCALE)
         waves = poses[:, 1:].reshape(len(poses), -1, 2)
         short = 1 - np.minimum(np.linalg.norm(waves, axis=-1), 1)  # an unsure mean lies inside the circle
         angles = _smooth(np.unwrap(np.arctan2(waves[..., 0], waves[..., 1]), axis=0))
-        motion = kinematics.motion_of(_rate(height, fps), angles, _rate(angles, fps))
+        body = body_of(robot_named("hopper"))
+        motion = body.motion_of(_rate(height, fps), angles, _rate(angles, fps))
         return Track(
-            pose=kinematics.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
+            pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
             doubt=np.linalg.norm(short, axis=-1).astype(np.float32),
         )  # fmt: skip
 
@@ -185,7 +187,7 @@ def pictures(
                 yield drawing.render(q[None]).result()[0]
 
         features = encoder.encode(drawn())
-    return features, kinematics.pose(qpos[:, 1:]).astype(np.float32)
+    return features, body_of(robot_named(env_name)).pose(qpos[:, 1:]).astype(np.float32)
 
 
 def regress(
@@ -249,7 +251,7 @@ def _network(features: int) -> nn.Sequential:
     layer = nn.utils.skip_init
     return nn.Sequential(
         layer(nn.Linear, features, 256), nn.ReLU(), layer(nn.Linear, 256, 128), nn.ReLU(),
-        layer(nn.Linear, 128, kinematics.POSE),
+        layer(nn.Linear, 128, body_of(robot_named("hopper")).pose_size),
     )  # fmt: skip
 
 

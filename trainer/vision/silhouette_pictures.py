@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,7 +20,9 @@ import numpy as np
 
 from onedemo.render.gl_context import open_context
 from onedemo.rl.random_states import wild_rollouts
-from onedemo.sim import kinematics, vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot
+from onedemo.sim.kinematics import body_of
 from onedemo.vision.silhouette_views import RATE, Views, views
 
 FRAMES = 14
@@ -34,6 +35,8 @@ _SECONDS = 0.96
 _STANDING = 0.25
 _FILMS_EACH = 2
 """Of each random state and what comes of it."""
+_NEAR = 0.03
+"""Metres above the ground at which contact is over."""
 TRAVEL_SCALE = 0.4
 """A metre a second of travel counts as this many units of the pose."""
 
@@ -52,20 +55,28 @@ class Films:
     """Length of the robot stretched out, metres."""
 
 
-def aims(qpos: np.ndarray, qvel: np.ndarray, obs: np.ndarray) -> np.ndarray:
-    """What is to be read of states: pose, motion, travel and contact, (..., A), float32."""
-    travel = TRAVEL_SCALE * qvel[..., :1]
-    lowest = np.minimum.reduce(list(kinematics.clearances(qpos).values()))
-    contact = np.clip(1 - lowest / 0.03, 0, 1)[..., None]
-    numbers = [kinematics.pose(obs), kinematics.motion(obs), travel, contact]
+def aims(robot: Robot, qpos: np.ndarray, obs: np.ndarray) -> np.ndarray:
+    """What is to be read of states, (..., q) and (..., o): pose, motion, travel and contact, (..., A)."""
+    body = body_of(robot)
+    travel = TRAVEL_SCALE * body.travel(obs)
+    contact = np.zeros(obs.shape[:-1])
+    if has_floor(robot):
+        lowest = np.minimum.reduce(list(body.clearances(qpos).values()))
+        contact = np.clip(1 - lowest / _NEAR, 0, 1)
+    numbers = [body.pose(obs), body.motion(obs), travel[..., None], contact[..., None]]
     return np.concatenate(numbers, axis=-1).astype(np.float32)
 
 
-def names_of(env_name: str) -> list[str]:
+def names_of(robot: Robot) -> list[str]:
     """Names of the numbers that ``aims`` gives, (A,)."""
-    limbs = [f"{wave} {limb}" for limb in ("torso", "thigh", "leg", "foot") for wave in ("sine", "cosine")]
-    pose = ["height", *limbs]
+    limbs = [f"{robot.limbs[0]}'s side"] * (not body_of(robot).planar) + list(robot.limbs[1:])
+    pose = ["height", *(f"{way} of {limb}" for limb in [robot.limbs[0], *limbs] for way in ("right", "up"))]
     return [*pose, *(f"rate of {number}" for number in pose), "travel", "contact"]
+
+
+def has_floor(robot: Robot) -> bool:
+    """Whether pictures show how far the robot is above a floor."""
+    return robot.root != "fixed" and robot.camera.up == 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -92,19 +103,29 @@ class Eye:
         return size / 2 + focal * depth * math.cos(tilt) / (self.distance - depth * math.sin(tilt))
 
 
+def facing(robot: Robot) -> Eye:
+    """The robot's own camera; it shows about three metres."""
+    axes = np.eye(3)
+    ahead = -np.cross(axes[robot.camera.right], axes[robot.camera.up])
+    azimuth = math.degrees(math.atan2(ahead[1], ahead[0])) if abs(ahead[2]) < 0.5 else 90.0
+    elevation = math.degrees(math.asin(ahead[2]))
+    return Eye(azimuth=azimuth, elevation=elevation, distance=robot.camera.distance, view=3.0)
+
+
 class Silhouettes:
     """Draws which geom of a robot each pixel shows. Belongs to the thread that made it; to be closed.
 
     Args:
-        xml: The robot's model.
+        robot: Whose.
         size: Rows and columns.
 
     Raises:
         UserError: If this machine cannot draw.
     """
 
-    def __init__(self, xml: Path, size: int = _SIZE) -> None:
-        spec = mujoco.MjSpec.from_file(str(xml))
+    def __init__(self, robot: Robot, size: int = _SIZE) -> None:
+        self.robot = robot
+        spec = mujoco.MjSpec.from_file(str(robot.xml))
         spec.visual.global_.offwidth = spec.visual.global_.offheight = size
         spec.visual.quality.offsamples = 0
         self.model, self.size = spec.compile(), size
@@ -180,9 +201,9 @@ def films(env_name: str, count: int, seed: int, check: Callable[[float], None]) 
     Raises:
         UserError: If this machine cannot draw.
     """
-    spec, rng = vector_env.spec(env_name), np.random.default_rng(seed)
-    qpos, shown = _states(env_name, count, seed, rng)
-    with Silhouettes(spec.xml) as drawing:
+    robot, rng = robot_named(env_name), np.random.default_rng(seed)
+    qpos, shown = _states(robot, count, seed, rng)
+    with Silhouettes(robot) as drawing:
         reach = length_of(drawing, qpos[:, 0])
         seen = []
         for number, film in enumerate(qpos):
@@ -195,20 +216,18 @@ def films(env_name: str, count: int, seed: int, check: Callable[[float], None]) 
     )  # fmt: skip
 
 
-def _states(env_name: str, count: int, seed: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _states(robot: Robot, count: int, seed: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Positions of the frames of films, (n, T, q), and what they show, (n, T, A)."""
-    dt = vector_env.spec(env_name).dt
-    every = round(_SECONDS / dt)
-    steps = np.round(np.arange(FRAMES) / RATE / dt).astype(int)
+    every = round(_SECONDS / robot.dt)
+    steps = np.round(np.arange(FRAMES) / RATE / robot.dt).astype(int)
     starts = -(-count // _FILMS_EACH)
     rollouts = wild_rollouts(
-        env_name, lanes=-(-starts // 8), steps=8 * every, every=every, seed=seed, standing=_STANDING
+        robot.name, lanes=-(-starts // 8), steps=8 * every, every=every, seed=seed, standing=_STANDING
     )
     lane, episode = np.divmod(rng.permutation(starts).repeat(_FILMS_EACH)[:count], 8)
     first = rng.integers(every - steps[-1], size=count)
     at = (lane[:, None], (episode * every + first)[:, None] + steps)
-    qpos, obs = rollouts.qpos[at], rollouts.obs[at]
-    return qpos, aims(qpos, obs[..., qpos.shape[-1] - 1 :], obs)
+    return rollouts.qpos[at], aims(robot, rollouts.qpos[at], rollouts.obs[at])
 
 
 def length_of(drawing: Silhouettes, qpos: np.ndarray) -> float:
@@ -226,27 +245,31 @@ def length_of(drawing: Silhouettes, qpos: np.ndarray) -> float:
         middle = data.geom_xpos[mine] + np.einsum("gij,gj->gi", turn, model.geom_aabb[mine, :3])
         half = np.einsum("gij,gj->gi", np.abs(turn), model.geom_aabb[mine, 3:])
         sides = (middle + half).max(axis=0) - (middle - half).min(axis=0)
-        diagonals.append(np.hypot(sides[0], sides[2]))
+        diagonals.append(np.hypot(sides[drawing.robot.camera.right], sides[drawing.robot.camera.up]))
     return float(np.percentile(diagonals, 95))
 
 
 def _seen(drawing: Silhouettes, qpos: np.ndarray, reach: float, rng: np.random.Generator) -> Views:
     """What is seen of a film, (T, q)."""
+    camera = drawing.robot.camera
+    straight, tilt = facing(drawing.robot), rng.uniform(-26, 5)
     eye = Eye(
-        azimuth=90 + rng.uniform(-14, 14), elevation=rng.uniform(-26, 5),
+        azimuth=straight.azimuth + rng.uniform(-14, 14),
+        elevation=straight.elevation + (tilt if straight.elevation > -45 else abs(tilt)),
         distance=reach * rng.uniform(1.7, 3.2), view=reach * _VIEW,
     )  # fmt: skip
-    aside = np.array([*reach * rng.uniform(-0.1, 0.1, 2), 0.0])[[0, 2, 1]]
+    aside = np.zeros(3)
+    aside[[camera.right, camera.up]] = reach * rng.uniform(-0.1, 0.1, 2)
     at = np.stack([drawing.middle(q) for q in qpos]) + aside
     ids = np.stack([drawing.draw(q, eye, place) for q, place in zip(qpos, at, strict=True)])
-    scale, way = drawing.size / eye.view, at[:, 0]
-    floor = eye.row_below(drawing.size, at[:, 2])
+    scale, way = drawing.size / eye.view, at[:, camera.right]
+    floor = eye.row_below(drawing.size, at[:, camera.up])
     masks = _spoilt(ids, floor, reach * scale, rng)
     floor += scale * (rng.normal(0, 0.03) + rng.normal(0, 0.008, len(qpos)))
-    wrong = rng.uniform(0.9, 1.1)
+    wrong, known = rng.uniform(0.9, 1.1), rng.random() >= 0.1 and has_floor(drawing.robot)
     return views(
         masks,
-        floor=np.full(len(qpos), np.nan) if rng.random() < 0.1 else floor,
+        floor=floor if known else np.full(len(qpos), np.nan),
         scale=scale * wrong,
         way=None if rng.random() < 0.15 else way / wrong + rng.normal(0, 0.004, len(qpos)),
         reach=reach,

@@ -14,9 +14,12 @@ from onedemo.annotators.oracle import Oracle
 from onedemo.app.annotation.examples import choose
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.demos.library import BUILT_IN, find_demo
-from onedemo.sim import kinematics
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import body_of
 from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track, shipped_track
+
+BODY = body_of(robot_named("hopper"))
 
 DT, LENGTH = 0.008, 9
 DEMOS = ("hopper-backflip", "hopper-hop", "hopper-flip-clean")
@@ -87,14 +90,14 @@ def test_where_the_body_is_unknown_only_the_same_moment_twice_is_shown():
 
 def test_a_robot_that_hardly_moves_has_no_far_examples():
     angles = 0.05 * np.sin(np.arange(120)[:, None] / 9 + np.arange(4))
-    pose = kinematics.pose_of(np.full(120, 1.2), angles).astype(np.float32)
+    pose = BODY.pose_of(np.full(120, 1.2), angles).astype(np.float32)
     chosen = choose(Track(pose=pose, motion=np.zeros_like(pose)), 120, LENGTH)
     assert {e.rating for e in (*chosen.guide, *chosen.practice)} == {5}
 
 
 @pytest.mark.parametrize("frames", [9, 10, 20])
 def test_a_short_demo_has_what_it_has(frames):
-    pose = kinematics.pose_of(np.linspace(1, 2, frames), np.linspace(0, 3, 4 * frames).reshape(-1, 4))
+    pose = BODY.pose_of(np.linspace(1, 2, frames), np.linspace(0, 3, 4 * frames).reshape(-1, 4))
     track = Track(pose=pose.astype(np.float32), motion=np.zeros_like(pose, np.float32))
     for known in (track, None):
         chosen = choose(known, frames, LENGTH)
@@ -104,7 +107,7 @@ def test_a_short_demo_has_what_it_has(frames):
 def test_what_is_said_of_an_example_is_what_differs():
     same = np.zeros(240)
     height = np.where(np.arange(240) < 120, 1.0, 1.9)
-    pose = kinematics.pose_of(height, np.stack([same] * 4, -1)).astype(np.float32)
+    pose = BODY.pose_of(height, np.stack([same] * 4, -1)).astype(np.float32)
     chosen = choose(Track(pose=pose, motion=np.zeros_like(pose)), 240, LENGTH)
     (example,) = [e for e in chosen.guide if e.rating == 3]
     assert example.why == "The pose differs clearly; direction and pace fit."

@@ -9,7 +9,7 @@ from helpers.small_world import Thumbnail, falling_demo, small_config
 from onedemo.annotators.oracle import Oracle, RatingBudgetSpent, appearance, make_rater
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
-from onedemo.sim.vector_env import observe, spec
+from onedemo.robots.registry import robot_named
 from onedemo.storage.store import Store
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo, Segment
@@ -27,13 +27,13 @@ def states(steps=100, spin=-0.03):
 @pytest.fixture
 def hidden():
     qpos, qvel = states()
-    obs = observe(spec("hopper"), qpos, qvel)
+    obs = robot_named("hopper").observe(qpos, qvel)
     return HiddenStates(obs=obs, actions=np.zeros((100, 3)), qpos=qpos, qvel=qvel)
 
 
 def segment(qpos, qvel, start, length=38):
     cut = slice(start, start + length)
-    obs = observe(spec("hopper"), qpos[cut], qvel[cut])
+    obs = robot_named("hopper").observe(qpos[cut], qvel[cut])
     return Segment(obs=obs, actions=np.zeros((length, 3)), qpos=qpos[cut], qvel=qvel[cut])
 
 

@@ -12,7 +12,7 @@ from onedemo.annotators.oracle import make_rater
 from onedemo.annotators.scripted import Script, load_marks, marked, table_path, visible
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
-from onedemo.sim.kinematics import CONTACT_MARGIN, clearances
+from onedemo.robots.hopper import CONTACT_MARGIN, clearances
 from onedemo.training.learner import Learner
 from onedemo.types import Demo, Segment
 

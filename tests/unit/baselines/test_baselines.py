@@ -14,8 +14,9 @@ from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import evaluate
+from onedemo.robots.hopper import clearances, fallen
+from onedemo.robots.registry import robot_named
 from onedemo.sim import vector_env
-from onedemo.sim.kinematics import clearances, fallen
 from onedemo.sim.task_rewards import backflip_reward, task_reward, until_fall
 
 
@@ -171,8 +172,8 @@ def test_shipped_demos(name):
     hidden = load_hidden(DEMOS / f"{name}.hidden.npz")
     assert len(hidden.actions) == 1000
     assert np.abs(hidden.qpos[0] - [0, 1.25, 0, 0, 0, 0]).max() <= 0.005
-    spec = vector_env.spec("hopper")
-    np.testing.assert_allclose(hidden.obs, vector_env.observe(spec, hidden.qpos, hidden.qvel))
+    spec = robot_named("hopper")
+    np.testing.assert_allclose(hidden.obs, spec.observe(hidden.qpos, hidden.qvel))
     reward = backflip_reward(hidden.obs[1:], hidden.actions).sum()
     if name == "hopper-backflip":
         assert net_turns(hidden.qpos[:, 2]) >= 4

@@ -56,7 +56,7 @@ from onedemo.storage.store import Store
         (f"serve --seed {2**70}", "argument --seed: invalid int value"),
         (f"baseline trpo --out x --seed {2**70}", "argument --seed: invalid int value"),
         ("train --set policy.hidden=[1.5]", "policy.hidden must be a list of whole numbers"),
-        ("train --set env=walker --quiet", "unknown environment 'walker'"),
+        ("train --set env=walker --quiet", "unknown robot 'walker'"),
         ("train --json /", "/ is a directory"),
         ("train --json /nowhere/out.json", "cannot write /nowhere/out.json"),
         ("serve --host a..b", "--host a..b lets other machines in"),

@@ -311,7 +311,7 @@ EDITED = {
     "HTML as a version": (about({"version": "<b>1"}), "version is not a version"),
     "a seed of 2^70": (about({"seed": 2**70}), "seed is out of range"),
     "settings that are none": (about({"config": "a = ="}), "does not say what its runs are"),
-    "another robot": (about({"config": "env = 'dog'"}), "unknown environment 'dog'"),
+    "another robot": (about({"config": "env = 'dog'"}), "unknown robot 'dog'"),
     "a day that is none in a run": (about({"created_at": "yesterday"}), "a time in UTC"),
 }  # fmt: skip
 

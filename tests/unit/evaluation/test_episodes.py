@@ -13,7 +13,7 @@ from onedemo.evaluation.episodes import aligned_similarity, per_episode, spread,
 from onedemo.evaluation.time_warping import align
 from onedemo.experiments.jobs.controls import TrueRating
 from onedemo.rl.rollouts import Episodes
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_the_true_rating_is_the_oracles(clean, tmp_path):
     demo = find_demo("hopper-flip-clean", tmp_path)
     hop = load_hidden(BUILT_IN / "hopper-hop.hidden.npz")
     snapshot, oracle = TrueRating(demo, clean), Oracle(clean, budget=0)
-    frames, dt = np.arange(demo.frames), vector_env.spec("hopper").dt
+    frames, dt = np.arange(demo.frames), robot_named("hopper").dt
     steps = steps_of_frames(demo.frames, dt, demo.fps)
     assert (snapshot.ratings(frames, clean.obs[steps], clean.actions[steps]) == 5).all()
     ratings = snapshot.ratings(frames, hop.obs[steps], hop.actions[steps])

@@ -10,8 +10,7 @@ from onedemo.experiments.report import document
 from onedemo.experiments.report.account import complete
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.tables import pose as table
-from onedemo.sim import vector_env
-from onedemo.vision.silhouette_pictures import Silhouettes
+from onedemo.robots.registry import robot_named
 
 
 def frames(count=4, size=64):
@@ -48,32 +47,30 @@ def test_lossless_video_comes_back_in_order():
 @pytest.mark.parametrize("look", LOOKS)
 def test_the_camera_of_a_look_is_the_one_that_masks_are_drawn_for(look):
     """What differs from a drawing without the robot lies where the true mask is."""
-    xml, where = vector_env.spec("hopper").xml, LOOKS[look]
+    robot, where = robot_named("hopper"), LOOKS[look]
     qpos = np.tile([0.0, 1.25, 0.0, -0.3, -0.5, 0.3], (2, 1))
     away = qpos + np.array([0.0, 30.0, 0, 0, 0, 0])
-    shown, empty = where.draw("hopper", xml, qpos), where.draw("hopper", xml, away)
+    shown, empty = where.draw(robot, qpos), where.draw(robot, away)
     assert shown.shape[1:3] == where.size[::-1]
-    truth = pose.true_masks("hopper", where, qpos)
+    truth = pose.true_masks(robot, where, qpos)
     rows, columns = np.nonzero(np.abs(shown[0].astype(int) - empty[0]).max(axis=2) > 60)
     by = 240 / shown.shape[1]
     right = np.argwhere(truth.masks[0])
     middle = np.median(rows) * by, (np.median(columns) - shown.shape[2] / 2) * by + 120
     assert np.abs(np.median(right, axis=0) - middle).max() < 12
-    with Silhouettes(xml, 240) as drawing:
-        assert drawing.middle(qpos[0])[2] < where.height + 0.5
 
 
 def test_scores_of_a_perfect_reader_are_one():
     rng = np.random.default_rng(0)
     right = rng.normal(size=(50, 20))
     perfect = pose.Seen(read=right, doubt=rng.uniform(size=50), right=right, iou=np.ones(50))
-    scores = pose.scores("hopper", [perfect])
+    scores = pose.scores(robot_named("hopper"), [perfect])
     assert set(scores["explained"].values()) == {1.0} and scores["iou"] == 1 and scores["of_sure"] == 1
     mean = pose.Seen(
         read=np.tile(right.mean(axis=0), (50, 1)), doubt=np.abs(right[:, :9]).sum(axis=1), right=right,
         iou=np.zeros(50),
     )  # fmt: skip
-    scores = pose.scores("hopper", [mean])
+    scores = pose.scores(robot_named("hopper"), [mean])
     np.testing.assert_allclose(list(scores["explained"].values()), 0, atol=1e-3)
     assert scores["doubt"] > 0.5 and scores["sure"] == 0 and scores["of_sure"] is None
 
@@ -86,7 +83,7 @@ def test_a_job_from_its_films_to_the_report(tmp_path):
     result = document.plain(pose.run({**job.settings, "films": 1, "seconds": 1.0}, 101, tmp_path))
     assert tuple(result) == pose.HOW
     explained = result[pose.TRUE]["explained"]
-    assert np.mean([explained[f"{wave} torso"] for wave in ("sine", "cosine")]) > 0.7
+    assert np.mean([explained[f"{way} of torso"] for way in ("right", "up")]) > 0.7
     report = table.TABLE.report([Outcome(job=job, kept={"result": result})], quick=True)
     text = document.as_text(complete(report, [Outcome(job=job, kept={"result": result, "machine": {}})],
                                      command="onedemo bench pose", quick=True))  # fmt: skip

@@ -13,7 +13,7 @@ from onedemo.render.clip_image import compose_clip, read_about
 from onedemo.render.framing import Extent, clip_sides, film_sides, views_of
 from onedemo.render.mover import BODY, is_studio, locate
 from onedemo.render.renderer import CLOSE_HEIGHT, CLOSE_WIDTH, Renderer, studio
-from onedemo.sim.kinematics import joint_points
+from onedemo.robots.hopper import joint_points
 
 STANDING = Extent(left=-0.2, right=0.3, low=0.0, high=1.5)
 FLYING = Extent(left=-0.6, right=0.5, low=0.7, high=1.6)

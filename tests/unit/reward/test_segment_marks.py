@@ -134,7 +134,10 @@ def test_the_metric_learns_from_marks_what_the_ratings_cannot_tell(view_of_two):
 def view_of_two():
     """Ratings whose marks blame the spin, not the height; and which log weights tell."""
     from onedemo.reward.model import View
-    from onedemo.sim import kinematics
+    from onedemo.robots.registry import robot_named
+    from onedemo.sim.kinematics import body_of
+
+    BODY = body_of(robot_named("hopper"))
     from onedemo.vision.pose_estimator import Track
 
     rng = np.random.default_rng(0)
@@ -152,8 +155,8 @@ def view_of_two():
         )
         ratings.append(RatedSegment(event=i + 1, demo_step=0, segment=segment, value=value, mark=(W // 2, W)))
     track = Track(
-        pose=kinematics.pose(still[None]).astype(np.float32),
-        motion=kinematics.motion(still[None]).astype(np.float32),
+        pose=BODY.pose(still[None]).astype(np.float32),
+        motion=BODY.motion(still[None]).astype(np.float32),
     )
     view = View(
         visual=np.zeros((1, 2), np.float32), track=track, basis=np.zeros((1, 2), np.float32), fps=30.0
@@ -161,12 +164,10 @@ def view_of_two():
 
     moved = still.copy()
     moved[0] += 1
-    height = int(np.abs(kinematics.pose(moved[None]) - kinematics.pose(still[None]))[0].argmax())
+    height = int(np.abs(BODY.pose(moved[None]) - BODY.pose(still[None]))[0].argmax())
     moved = still.copy()
     moved[7] += 1
-    spin = kinematics.POSE + int(
-        np.abs(kinematics.motion(moved[None]) - kinematics.motion(still[None]))[0].argmax()
-    )
+    spin = BODY.pose_size + int(np.abs(BODY.motion(moved[None]) - BODY.motion(still[None]))[0].argmax())
 
     def weight_of(snapshot):
         return snapshot.log_weights[0, height], snapshot.log_weights[0, spin]

@@ -10,7 +10,8 @@ from onedemo.errors import UserError
 from onedemo.reward.latent_track import track_basis
 from onedemo.reward.model import PredictorConfig, Snapshot, View, fit, fit_lens
 from onedemo.reward.warm_start import newest_snapshot
-from onedemo.sim import kinematics
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import body_of
 from onedemo.storage.rating_records import RatedSegment
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
@@ -20,6 +21,8 @@ from onedemo.types import Segment
 from onedemo.vision.pose_estimator import Track
 from unit.reward.test_model import world
 from unit.training.test_trainer import by_rule, make_run, work
+
+BODY = body_of(robot_named("hopper"))
 
 NETWORK = PredictorConfig(kind="network", appearance=False, members=2, updates=600, visual_dims=8)
 METRIC = PredictorConfig(members=2)
@@ -124,9 +127,7 @@ def poses(count, seed, matters):
         visual=np.zeros((FRAMES, 1), np.float32),
         basis=np.ones((FRAMES, 1), np.float32),
         fps=30.0,
-        track=Track(
-            pose=kinematics.pose(shown).astype(np.float32), motion=kinematics.motion(shown).astype(np.float32)
-        ),
+        track=Track(pose=BODY.pose(shown).astype(np.float32), motion=BODY.motion(shown).astype(np.float32)),
     )
     ratings = []
     for event in range(count):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from onedemo.rl.random_states import HeldNoise, RandomStarts, random_states, wild_rollouts
-from onedemo.sim.kinematics import clearances
+from onedemo.robots.hopper import clearances
 
 RANGES = np.radians([[-150, 0], [-150, 0], [-45, 45]])  # of thigh, leg and foot, hopper.xml
 
@@ -62,7 +62,7 @@ def test_standing_starts_are_the_environments_own():
 
 
 def test_noise_is_held_and_ends_by_itself():
-    noise, rng = HeldNoise(64, hold=10), np.random.default_rng(0)
+    noise, rng = HeldNoise(64, 3, hold=10), np.random.default_rng(0)
     seen = noise.inputs(np.zeros((64, 11)), np.zeros(64))
     assert seen.shape == (64, len(noise.mean))  # what a collector stores of it
     actions = np.stack([noise.act(seen, rng) for _ in range(400)], axis=1)

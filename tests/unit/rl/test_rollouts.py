@@ -9,6 +9,7 @@ import torch
 from onedemo.errors import UserError
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, evaluate
+from onedemo.robots.registry import robot_named
 from onedemo.sim import vector_env
 
 HORIZON = 40
@@ -165,9 +166,7 @@ def test_evaluate_gives_whole_episodes():
     assert episodes.actions.shape == (3, HORIZON, 3)
     assert episodes.qpos.shape == episodes.qvel.shape == (3, HORIZON + 1, 6)
     np.testing.assert_array_equal(episodes.clock, np.tile(np.arange(HORIZON + 1), (3, 1)))
-    np.testing.assert_array_equal(
-        episodes.obs, vector_env.observe(vector_env.spec("hopper"), episodes.qpos, episodes.qvel)
-    )
+    np.testing.assert_array_equal(episodes.obs, robot_named("hopper").observe(episodes.qpos, episodes.qvel))
     means = snapshot.act(snapshot.inputs(episodes.obs[:, :-1], episodes.clock[:, :-1]))
     np.testing.assert_allclose(episodes.actions, means, atol=1e-5)
     again = evaluate(snapshot, "hopper", episodes=3, seed=5, nthread=2)

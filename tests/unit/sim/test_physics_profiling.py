@@ -3,12 +3,13 @@
 import mujoco
 import numpy as np
 
+from onedemo.robots.registry import robot_named
 from onedemo.sim import physics_profiling, vector_env
 from onedemo.sim.physics import load_model
 
 
 def stepped():
-    model = load_model(vector_env.SPECS["hopper"].xml)
+    model = load_model(robot_named("hopper").xml)
     data = mujoco.MjData(model)
     data.ctrl[:] = 0.5, -0.3, 0.2
     mujoco.mj_step(model, data, 200)

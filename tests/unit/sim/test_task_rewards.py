@@ -7,7 +7,8 @@ import pytest
 from onedemo.demos.ground_truth import load_hidden
 from onedemo.demos.library import BUILT_IN
 from onedemo.evaluation import metrics
-from onedemo.sim import kinematics, task_rewards, vector_env
+from onedemo.robots import hopper
+from onedemo.sim import task_rewards, vector_env
 
 DT = 0.008
 
@@ -99,13 +100,13 @@ def test_geometry_is_the_models():
     contacts = 0
     poses = random_qpos(300, 0)
     # The last ones rest within the contact margin: a part lies on the ground before it reaches it.
-    gaps = kinematics.clearances(poses[250:])
+    gaps = hopper.clearances(poses[250:])
     lowest = np.minimum.reduce([gaps["torso"], gaps["thigh"], gaps["leg"]])
     poses[250:, 1] += np.linspace(0.0001, 0.004, 50) - lowest
     for qpos in poses:
         data.qpos[:] = qpos
         mujoco.mj_forward(model, data)
-        points, gaps = kinematics.joint_points(qpos), kinematics.clearances(qpos)
+        points, gaps = hopper.joint_points(qpos), hopper.clearances(qpos)
         for joint, point in (("thigh", "hip"), ("leg", "knee"), ("foot", "ankle")):
             np.testing.assert_allclose(
                 data.joint(f"{joint}_joint").xanchor[[0, 2]], points[point], atol=1e-12
@@ -118,7 +119,7 @@ def test_geometry_is_the_models():
         ids = [model.geom(f"{part}_geom").id for part in ("torso", "thigh", "leg")]
         pairs = [set(pair) for pair in data.contact.geom]
         touching = any({floor, i} in pairs for i in ids)
-        assert kinematics.fallen(qpos) == touching
+        assert hopper.fallen(qpos) == touching
         contacts += touching
     assert 50 < contacts < 270
 
@@ -149,11 +150,11 @@ def test_hop_reward_is_the_environments():
         qvel.append(env.qvel)
     qpos, qvel = np.stack(qpos, 1), np.stack(qvel, 1)
     actions, rewards = actions.swapaxes(0, 1), np.stack(rewards, 1)
-    obs = vector_env.observe(env.env_spec, qpos, qvel)
+    obs = env.robot.observe(qpos, qvel)
     np.testing.assert_allclose(task_rewards.task_reward("hop", obs, actions, qpos, qvel), rewards, atol=1e-9)
     assert task_rewards.task_reward("backflip", obs, actions, qpos, qvel).shape == (8, 80)
     alive = task_rewards.until_fall(qpos[:, 1:], qvel[:, 1:])
-    upright = vector_env.healthy(env.env_spec, qpos[:, 1:], qvel[:, 1:])
+    upright = env.robot.healthy(qpos[:, 1:], qvel[:, 1:])
     first_fall = (~upright).argmax(1)
     assert (~upright).any(1).all()
     np.testing.assert_array_equal(alive.sum(1), first_fall + 1)

@@ -15,6 +15,7 @@ from onedemo.experiments.speed.figures import Skipped
 from onedemo.rl.policy import Policy, PolicyConfig
 from onedemo.rl.rollouts import Collector
 from onedemo.rl.trpo import Trpo, TrpoConfig
+from onedemo.robots.registry import robot_named
 from onedemo.sim import vector_env
 from onedemo.sim.physics import RolloutPhysics, load_model
 from onedemo.training.learner import Learner
@@ -76,7 +77,7 @@ def apart(ours, theirs):
 
 def own_jump(qpos, qvel, action):
     """How far the processor's velocities after one step scatter when the state is moved by rounding."""
-    model = load_model(vector_env.SPECS["hopper"].xml)
+    model = load_model(robot_named("hopper").xml)
     physics = RolloutPhysics(model, 4, 200, 0)
     state = np.tile(np.concatenate([[0], qpos, qvel]), (200, 1))
     state[1:, 1:] += np.random.default_rng(0).normal(0, 5e-7, (199, 12))
@@ -198,7 +199,7 @@ def test_contacts_without_room_are_an_error(room):
     from onedemo.sim import warp_physics
 
     lying = np.tile([0, 0.05, -np.pi / 2, 0, 0, 0], (4, 1))
-    model = load_model(vector_env.SPECS["hopper"].xml)
+    model = load_model(robot_named("hopper").xml)
     states = np.concatenate([np.zeros((4, 1)), lying, np.zeros((4, 6))], axis=1)
     warp_physics.WarpPhysics(model, 4, 4).step(states, np.zeros((4, 3)))
     with pytest.raises(RuntimeError, match=f"room for, {room[0]} a lane with {room[1]} constraints"):
@@ -209,7 +210,7 @@ def test_an_unknown_device_names_those_there_are():
     from onedemo.sim.warp_physics import WarpPhysics
 
     with pytest.raises(UserError, match=r"no device 'cuda:7' .* there are: cpu"):
-        WarpPhysics(load_model(vector_env.SPECS["hopper"].xml), 4, 1, device="cuda:7")
+        WarpPhysics(load_model(robot_named("hopper").xml), 4, 1, device="cuda:7")
 
 
 def test_without_the_package_the_error_names_the_extra(monkeypatch):

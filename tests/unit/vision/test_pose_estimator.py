@@ -10,10 +10,14 @@ import torch
 from helpers.small_world import FRAME_STEPS, Thumbnail, falling_states
 from onedemo.demos.library import list_demos, stream_frames
 from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
+from onedemo.robots.registry import robot_named
 from onedemo.sim import kinematics
+from onedemo.sim.kinematics import body_of
 from onedemo.vision import pose_estimator
 from onedemo.vision.encoders import make_encoder
 from onedemo.vision.pose_estimator import PoseEstimator, learn, pictures, regress
+
+BODY = body_of(robot_named("hopper"))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -29,7 +33,7 @@ def one_thread():
 
 def seen(poses, seed=0):
     """What a plain encoder would make of poses: a random mixture of them, and of their squares."""
-    mixture = np.random.default_rng(seed).normal(size=(2 * kinematics.POSE, 40)).astype(np.float32)
+    mixture = np.random.default_rng(seed).normal(size=(2 * BODY.pose_size, 40)).astype(np.float32)
     return np.concatenate([poses, np.square(poses)], axis=1) @ mixture
 
 
@@ -38,7 +42,7 @@ def poses():
     rng = np.random.default_rng(1)
     obs = np.zeros((600, 11))
     obs[:, 0], obs[:, 1:5] = rng.uniform(0.2, 1.5, 600), rng.uniform(-np.pi, np.pi, (600, 4))
-    return kinematics.pose(obs).astype(np.float32)
+    return BODY.pose(obs).astype(np.float32)
 
 
 quick_regress = functools.partial(regress, epochs=10)
@@ -50,7 +54,7 @@ def test_the_regression_finds_the_pose_and_says_how_well(poses):
     held_out = seen(poses[540:]), poses[540:]
     error = np.square(learned.poses(held_out[0]) - held_out[1]).mean(axis=0)
     np.testing.assert_allclose(learned.held_out, 1 - error / held_out[1].var(axis=0), atol=1e-4)
-    assert learned.held_out.shape == (kinematics.POSE,) and learned.held_out.mean() > 0.85
+    assert learned.held_out.shape == (BODY.pose_size,) and learned.held_out.mean() > 0.85
     # Of features that have nothing to do with the pose it says so.
     assert quick_regress(np.random.default_rng(2).permutation(seen(poses)), poses).held_out.max() < 0.2
 
@@ -99,11 +103,11 @@ def test_the_track_of_a_steady_move_is_right_from_the_first_frame_to_the_last():
     times = np.arange(count)[:, None] / fps
     climb, spins = 2.0, np.array([-9.0, 3.0, 0.5, 6.0])
     height, angles = 0.3 + climb * times[:, 0], 1.0 + times * spins
-    frames = kinematics.pose_of(height, angles)
+    frames = BODY.pose_of(height, angles)
     track = PerfectEye().track(frames, fps)
     assert track.pose.dtype == track.motion.dtype == np.float32
     np.testing.assert_allclose(track.pose, frames, atol=1e-5)
-    expected = kinematics.motion_of(np.full(count, climb), angles, np.tile(spins, (count, 1)))
+    expected = BODY.motion_of(np.full(count, climb), angles, np.tile(spins, (count, 1)))
     np.testing.assert_allclose(track.motion, expected, atol=1e-5)
     # Twice as many frames a second: the same move.
     slow, fast = (PerfectEye().track(frames, rate).motion for rate in (fps, 2 * fps))
@@ -113,17 +117,15 @@ def test_the_track_of_a_steady_move_is_right_from_the_first_frame_to_the_last():
 def test_the_track_of_a_fall_is_near_its_true_motion():
     hidden = falling_states()
     obs = hidden.obs[FRAME_STEPS]
-    track = PerfectEye().track(kinematics.pose(obs), 30.0)
-    np.testing.assert_allclose(track.pose, kinematics.pose(obs), atol=0.2)
-    true = kinematics.motion(
-        obs
-    )  # a tenth of a second is seen at once, in which it jerks and hits the ground
+    track = PerfectEye().track(BODY.pose(obs), 30.0)
+    np.testing.assert_allclose(track.pose, BODY.pose(obs), atol=0.2)
+    true = BODY.motion(obs)  # a tenth of a second is seen at once, in which it jerks and hits the ground
     assert np.corrcoef(track.motion.ravel(), true.ravel())[0, 1] > 0.85
     assert np.abs(track.motion - true)[:2].mean() < 0.1 < np.abs(true).mean()
 
 
 def test_sines_that_fall_short_of_one_are_directions_all_the_same():
-    frames = kinematics.pose_of(np.full(9, 1.0), np.linspace(0, 1, 36).reshape(9, 4))
+    frames = BODY.pose_of(np.full(9, 1.0), np.linspace(0, 1, 36).reshape(9, 4))
     short = frames * np.r_[1.0, np.full(8, 0.6)]
     np.testing.assert_allclose(PerfectEye().track(short, 30.0).pose, PerfectEye().track(frames, 30.0).pose)
 
@@ -179,7 +181,7 @@ def test_it_knows_the_built_in_demos(learned, efficientnet, tmp_path):
 def test_pictures_come_with_the_poses_they_show():
     """As a picture is drawn of the pose beside it, one that is drawn of that pose again looks the same."""
     features, poses = pictures("hopper", Thumbnail(), 48)
-    assert features.shape == (48, Thumbnail.dims) and poses.shape == (48, kinematics.POSE)
+    assert features.shape == (48, Thumbnail.dims) and poses.shape == (48, BODY.pose_size)
     angles = np.arctan2(poses[:, 1::2], poses[:, 2::2])
     joints = angles[:, :-1] - angles[:, 1:]
     joints[:, :2] = (joints[:, :2] + np.pi) % (2 * np.pi) - np.pi
@@ -189,7 +191,7 @@ def test_pictures_come_with_the_poses_they_show():
         again = Thumbnail().encode(renderer.render(qpos))
     difference = np.abs(again[:, None] - features[None]).mean(axis=-1)
     assert (difference.argmin(axis=1) == np.arange(48)).mean() > 0.9
-    standing = np.abs(poses - kinematics.pose_of(np.array(1.25), np.zeros(4))).max(axis=1) < 0.05
+    standing = np.abs(poses - BODY.pose_of(np.array(1.25), np.zeros(4))).max(axis=1) < 0.05
     assert 0 < standing.sum() < 24  # some as they begin upright, most not
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from helpers.small_world import FRAME_STEPS, falling_states
-from onedemo.sim import kinematics, vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.sim import kinematics
 from onedemo.vision import learned_robots, silhouette
 from onedemo.vision.masks import Masks
 from onedemo.vision.silhouette import Silhouette, fit, learn
@@ -85,7 +86,7 @@ def drawn():
 
 @pytest.mark.seam
 def test_films_are_of_the_robot_and_what_it_does(drawn):
-    size = len(names_of("hopper"))
+    size = len(names_of(robot_named("hopper")))
     assert drawn.crops.shape == (6, FRAMES, SIDE, SIDE) and drawn.places.shape == (6, FRAMES, PLACES)
     assert drawn.aims.shape == (6, FRAMES, size) and 1.4 < drawn.reach < 1.8
     assert (drawn.crops > 127).mean() > 0.01 and np.isfinite(drawn.places).all()
@@ -100,7 +101,7 @@ def test_films_are_of_the_robot_and_what_it_does(drawn):
 def test_a_camera_shows_each_geom_where_it_is():
     hidden = falling_states()
     eye = Eye(azimuth=90, elevation=-15, distance=3.0, view=2.4)
-    with Silhouettes(vector_env.spec("hopper").xml, 200) as drawing:
+    with Silhouettes(robot_named("hopper"), 200) as drawing:
         for q in hidden.qpos[::25]:
             at = drawing.middle(q)
             which = drawing.draw(q, eye, at)
@@ -234,8 +235,8 @@ def test_a_known_robot_is_read_at_once_from_a_small_file(tmp_path):
 
     learned = learn("hopper", tmp_path, stop)
     assert not list(tmp_path.iterdir())
-    by_name = dict(zip(names_of("hopper"), learned.held_out, strict=True))
-    assert min(by_name[f"{wave} {limb}"] for wave in ("sine", "cosine") for limb in ("torso", "foot")) > 0.85
+    by_name = dict(zip(names_of(robot_named("hopper")), learned.held_out, strict=True))
+    assert min(by_name[f"{way} of {limb}"] for way in ("right", "up") for limb in ("torso", "foot")) > 0.85
     assert by_name["height"] > 0.8 and by_name["travel"] > 0.6
 
 
@@ -243,12 +244,12 @@ def test_a_known_robot_is_read_at_once_from_a_small_file(tmp_path):
 def test_it_reads_a_fall_from_drawn_masks(tmp_path):
     hidden, look = falling_states(), Eye(azimuth=90, elevation=-5, distance=3.5, view=3.0)
     qpos = hidden.qpos[FRAME_STEPS]
-    with Silhouettes(vector_env.spec("hopper").xml, 240) as drawing:
+    with Silhouettes(robot_named("hopper"), 240) as drawing:
         at = np.stack([drawing.middle(q) for q in qpos])
         masks = np.stack([drawing.draw(q, look, p) >= 0 for q, p in zip(qpos, at, strict=True)])
     found = masks_of(masks, floor=look.row_below(240, at[:, 2]), scale=80.0, way=at[:, 0])
     learned: Silhouette = learn("hopper", tmp_path)
     track = learned.track(found, 30.0)
-    right = aims(qpos, hidden.qvel[FRAME_STEPS], hidden.obs[FRAME_STEPS])[:, :9]
+    right = aims(robot_named("hopper"), qpos, hidden.obs[FRAME_STEPS])[:, :9]
     assert np.abs(track.pose - right).mean() < 0.15
     assert track.doubt.mean() < 0.4

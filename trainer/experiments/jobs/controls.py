@@ -28,7 +28,8 @@ from onedemo.experiments.jobs.method import POINTS, Watch, hidden_of, oracle_of,
 from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig
-from onedemo.sim import kinematics, vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import body_of
 from onedemo.training.learner import Learner
 from onedemo.types import Demo
 from onedemo.vision.pose_estimator import Track
@@ -106,9 +107,8 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
     torch.set_num_threads(1)
     learner = Learner(config, demo.frames, demo.fps)
     shown = hidden.obs[_steps(demo, hidden)]
-    track = Track(
-        pose=kinematics.pose(shown).astype(np.float32), motion=kinematics.motion(shown).astype(np.float32)
-    )
+    body = body_of(robot_named(config.env))
+    track = Track(pose=body.pose(shown).astype(np.float32), motion=body.motion(shown).astype(np.float32))
     learner.look_at(track.pose, track)
     snapshot = TrueRating(demo, hidden)
     watch = Watch(hidden, config.rollouts.total_steps)
@@ -171,7 +171,7 @@ def _baseline(demo: Demo, policy: Policy, curve: Sequence[Score]) -> dict[str, A
 
 def _steps(demo: Demo, hidden: HiddenStates) -> np.ndarray:
     """Control step that each frame shows."""
-    steps = steps_of_frames(demo.frames, vector_env.spec("hopper").dt, demo.fps)
+    steps = steps_of_frames(demo.frames, robot_named("hopper").dt, demo.fps)
     return np.minimum(steps, len(hidden.qpos) - 1)
 
 

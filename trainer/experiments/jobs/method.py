@@ -34,7 +34,7 @@ from onedemo.evaluation.episodes import per_episode, perform, predicted_similari
 from onedemo.experiments.runner import Job
 from onedemo.reward.model import Snapshot
 from onedemo.rl.rollouts import Episodes
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
@@ -232,7 +232,7 @@ def outcome(
     """
     alike = values.get("aligned_similarity")
     best = int(np.argmax(alike if alike is not None else values["net_turns"]))  # type: ignore[arg-type]
-    steps = steps_of_frames(demo.frames, vector_env.spec("hopper").dt, demo.fps)
+    steps = steps_of_frames(demo.frames, robot_named("hopper").dt, demo.fps)
     steps = np.minimum(steps, episodes.qpos.shape[1] - 1)
     return {
         "figures": {name: _figure(name, each) for name, each in values.items()},
@@ -254,7 +254,7 @@ def _errors(episodes: Episodes, oracle: Oracle | None, best: int) -> dict[str, S
     errors = state_errors(episodes.obs, oracle.hidden.obs)
     points = errors.shape[1] // _ERROR_EVERY
     errors = errors[:, : points * _ERROR_EVERY].reshape(len(errors), points, _ERROR_EVERY).mean(axis=-1)
-    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * vector_env.spec("hopper").dt
+    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * robot_named("hopper").dt
     figures = {"seconds": seconds, "best": errors[best], "mean": errors.mean(axis=0)}
     return {name: [round(float(x), 4) for x in values] for name, values in figures.items()}
 

@@ -24,7 +24,8 @@ from onedemo.errors import UserError
 from onedemo.experiments.jobs.method import hidden_of
 from onedemo.experiments.jobs.pose_looks import FAULTS, LOOKS, Look
 from onedemo.rl.random_states import wild_rollouts
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot
 from onedemo.vision.masks import Masks, find_masks
 from onedemo.vision.silhouette import Silhouette, learn
 from onedemo.vision.silhouette_pictures import Silhouettes, aims, names_of
@@ -58,30 +59,29 @@ def run(settings: Mapping[str, Any], seed: int, scratch: Path, cache: Path | Non
         its rank correlation with the error; ``sure``, the share of frames with a doubt below a half; ``iou``
         of the masks with the true ones.
     """
-    name = settings["robot"]
+    robot = robot_named(settings["robot"])
     if (look := LOOKS.get(settings["look"])) is None:
         raise UserError(f"there is no look {settings['look']!r}; choose one of: {', '.join(LOOKS)}")
     kept = (cache or scratch) / "robots"
     with hold(kept / "lock", wait=True):
-        learned = learn(name, kept)
-    films = _films(name, settings, seed)
+        learned = learn(robot.name, kept)
+    films = _films(robot, settings, seed)
     seen: dict[str, list[Seen]] = {how: [] for how in HOW}
     for states in films:
-        truth = true_masks(name, look, states.qpos)
-        seen[TRUE].append(_read(learned, truth, states, truth))
-        frames = look.draw(name, vector_env.spec(name).xml, states.qpos)
+        truth = true_masks(robot, look, states.qpos)
+        seen[TRUE].append(_read(learned, robot, truth, states, truth))
+        frames = look.draw(robot, states.qpos)
         for fault, spoil in FAULTS.items():
             found = find_masks(_small(spoil(frames)), length=learned.reach).of_length(learned.reach)
-            seen[fault].append(_read(learned, found, states, truth))
-    return {how: scores(name, each) for how, each in seen.items()}
+            seen[fault].append(_read(learned, robot, found, states, truth))
+    return {how: scores(robot, each) for how, each in seen.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class _States:
-    """Of the frames of a film: (F, q), (F, v), (F, o)."""
+    """Of the frames of a film: (F, q), (F, o)."""
 
     qpos: np.ndarray
-    qvel: np.ndarray
     obs: np.ndarray
 
 
@@ -95,37 +95,39 @@ class Seen:
     iou: np.ndarray
 
 
-def _films(name: str, settings: Mapping[str, Any], seed: int) -> list[_States]:
+def _films(robot: Robot, settings: Mapping[str, Any], seed: int) -> list[_States]:
     """Films of random states, and of each simulated demo of the robot a part that the seed chooses."""
-    dt = vector_env.spec(name).dt
-    steps = steps_of_frames(int(settings["seconds"] * _FPS), dt, _FPS)
+    steps = steps_of_frames(int(settings["seconds"] * _FPS), robot.dt, _FPS)
     every = int(steps[-1]) + 1
     rollouts = wild_rollouts(
-        name, lanes=settings["films"], steps=every, every=every, seed=_STATES_FROM + seed, standing=_STANDING
+        robot.name,
+        lanes=settings["films"],
+        steps=every,
+        every=every,
+        seed=_STATES_FROM + seed,
+        standing=_STANDING,
     )
     wild = [
-        _States(*(of[lane, steps] for of in (rollouts.qpos, rollouts.qvel, rollouts.obs)))
-        for lane in range(settings["films"])
+        _States(rollouts.qpos[lane, steps], rollouts.obs[lane, steps]) for lane in range(settings["films"])
     ]
     rng = np.random.default_rng(_STATES_FROM + seed)
     for hidden in [hidden_of(demo) for demo in built_in()]:
         if hidden is None or hidden.qpos.shape[-1] != rollouts.qpos.shape[-1]:
             continue
         at = steps + rng.integers(max(1, len(hidden.qpos) - every))
-        wild.append(_States(hidden.qpos[at], hidden.qvel[at], hidden.obs[at]))
+        wild.append(_States(hidden.qpos[at], hidden.obs[at]))
     return wild
 
 
-def true_masks(name: str, look: Look, qpos: np.ndarray) -> Masks:
+def true_masks(robot: Robot, look: Look, qpos: np.ndarray) -> Masks:
     """As MuJoCo draws them for the camera of a look: what a perfect search would find."""
-    with Silhouettes(vector_env.spec(name).xml, _WIDTH) as drawing:
-        at = np.stack([drawing.middle(q) for q in qpos])
-        at[:, 2] = look.height
+    with Silhouettes(robot, _WIDTH) as drawing:
+        at = look.places(robot, qpos)
         masks = [drawing.draw(q, look.eye, place) >= 0 for q, place in zip(qpos, at, strict=True)]
-    floor = look.eye.row_below(_WIDTH, at[:, 2])
+    floor = look.eye.row_below(_WIDTH, at[:, robot.camera.up])
     return Masks(
-        masks=np.stack(masks), floor=floor, scale=_WIDTH / look.eye.view, way=at[:, 0] - at[0, 0],
-        doubt=np.zeros(len(qpos)), method="still",
+        masks=np.stack(masks), floor=floor, scale=_WIDTH / look.eye.view,
+        way=at[:, robot.camera.right] - at[0, robot.camera.right], doubt=np.zeros(len(qpos)), method="still",
     )  # fmt: skip
 
 
@@ -134,10 +136,10 @@ def _small(frames: np.ndarray) -> np.ndarray:
     return np.stack([cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in frames])
 
 
-def _read(learned: Silhouette, found: Masks, states: _States, truth: Masks) -> Seen:
+def _read(learned: Silhouette, robot: Robot, found: Masks, states: _States, truth: Masks) -> Seen:
     numbers, doubt = learned.numbers(found, _FPS)
     return Seen(
-        read=numbers, doubt=doubt, right=aims(states.qpos, states.qvel, states.obs),
+        read=numbers, doubt=doubt, right=aims(robot, states.qpos, states.obs),
         iou=np.array([_alike(*pair) for pair in zip(found.masks, truth.masks, strict=True)]),
     )  # fmt: skip
 
@@ -154,7 +156,7 @@ def _alike(found: np.ndarray, truth: np.ndarray) -> float:
     return float((shapes[0] & shapes[1]).sum() / max(1, (shapes[0] | shapes[1]).sum()))
 
 
-def scores(name: str, seen: Sequence[Seen]) -> dict[str, Any]:
+def scores(robot: Robot, seen: Sequence[Seen]) -> dict[str, Any]:
     """How right it is over films, and how well it knows that: see ``run``."""
     read, doubt, right, iou = (
         np.concatenate([getattr(film, field) for film in seen]) for field in ("read", "doubt", "right", "iou")
@@ -162,12 +164,13 @@ def scores(name: str, seen: Sequence[Seen]) -> dict[str, Any]:
     error = np.square(read - right)
     spread = np.square(right - right.mean(axis=0)).mean(axis=0)
     explained = 1 - error.mean(axis=0) / np.maximum(spread, 1e-9)
-    wrong = error[:, : (right.shape[1] - 2) // 2].mean(axis=1)
+    size = (right.shape[1] - 2) // 2
+    wrong = error[:, :size].mean(axis=1)
     sure = doubt < _SURE
     return {
-        "explained": dict(zip(names_of(name), np.round(explained, 4).tolist(), strict=True)),
+        "explained": dict(zip(names_of(robot), np.round(explained, 4).tolist(), strict=True)),
         "sure": round(float(sure.mean()), 4),
-        "of_sure": round(float(1 - error[sure].mean(axis=0)[1:9].mean() / spread[1:9].mean()), 4)
+        "of_sure": round(float(1 - error[sure].mean(axis=0)[1:size].mean() / spread[1:size].mean()), 4)
         if sure.any() else None,
         "doubt": round(float(np.corrcoef(_ranks(doubt), _ranks(wrong))[0, 1]), 4),
         "iou": round(float(iou.mean()), 4),

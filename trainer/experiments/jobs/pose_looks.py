@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import av
@@ -21,6 +20,7 @@ import numpy as np
 
 from onedemo.render.gl_context import open_context
 from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FOVY, Renderer
+from onedemo.robots.robot import Robot, model_of
 from onedemo.vision.silhouette_pictures import Eye
 
 GYMNASIUM = {"hopper": "Hopper-v5", "walker2d": "Walker2d-v5", "half-cheetah": "HalfCheetah-v5"}
@@ -33,17 +33,32 @@ class Look:
 
     eye: Eye
     """The camera that masks are drawn for: it is the look's own."""
-    height: float
-    """Of what the camera looks at, metres; it follows the robot along the floor."""
+    height: float | None
+    """Of what the camera looks at, metres; it follows the robot along the floor. None: it is the model's own
+    camera, which keeps its place beside the centre of mass."""
     size: tuple[int, int]
     """Columns and rows."""
-    draw: Callable[[str, Path, np.ndarray], np.ndarray]
-    """Frames, (F, H, W, 3), of the robot of that name and model in positions (F, q)."""
+    draw: Callable[[Robot, np.ndarray], np.ndarray]
+    """Frames, (F, H, W, 3), of a robot in positions (F, q)."""
+
+    def places(self, robot: Robot, qpos: np.ndarray) -> np.ndarray:
+        """What the camera looks at: by the centre of mass, metres, (F, 3)."""
+        model = model_of(robot.xml)
+        data, places = mujoco.MjData(model), np.zeros((len(qpos), 3))
+        mujoco.mj_forward(model, data)
+        above = data.cam_xpos[0, 2] - data.subtree_com[0, 2]
+        for place, q in zip(places, qpos, strict=True):
+            data.qpos[:] = q
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            place[:] = data.subtree_com[0]
+            place[2] = place[2] + above if self.height is None else self.height
+        return places
 
 
-def gymnasium_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
+def gymnasium_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
     """As gymnasium's environment renders, by the camera of its model that follows the robot."""
-    env = gymnasium.make(GYMNASIUM[name], render_mode="rgb_array", camera_name="track")
+    env = gymnasium.make(GYMNASIUM[robot.name], render_mode="rgb_array", camera_name="track")
     env.reset(seed=0)
     frames = []
     for q in qpos:
@@ -53,9 +68,9 @@ def gymnasium_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
     return np.asarray(frames)
 
 
-def viser_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
+def viser_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
     """MuJoCo's drawing in mjviser's colours: the model's own limbs, a white sky, thin lines on the floor."""
-    spec = mujoco.MjSpec.from_file(str(xml))
+    spec = mujoco.MjSpec.from_file(str(robot.xml))
     width, height = VISER.size
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
     spec.visual.global_.fovy = VISER.eye.fovy
@@ -95,15 +110,15 @@ def viser_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
     return frames[:, ::-1]
 
 
-def our_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
+def our_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
     """As this program draws."""
-    with Renderer(model_path=xml) as renderer:
+    with Renderer(model_path=robot.xml) as renderer:
         return renderer.render(qpos)
 
 
-def turned_frames(name: str, xml: Path, qpos: np.ndarray) -> np.ndarray:
+def turned_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
     """The same in other colours: all hues turned by a third of the circle."""
-    frames = our_frames(name, xml, qpos)
+    frames = our_frames(robot, qpos)
     for frame in frames:
         colours = cv2.cvtColor(frame, cv2.COLOR_RGB2HSV)
         colours[..., 0] = (colours[..., 0] + np.uint8(60)) % 180
@@ -122,7 +137,7 @@ VISER = Look(
 )  # fmt: skip
 LOOKS: Mapping[str, Look] = {
     "gymnasium": Look(
-        eye=Eye(azimuth=90, elevation=0, distance=3.0, view=_view(45, 3.0)), height=1.0, size=(480, 480),
+        eye=Eye(azimuth=90, elevation=0, distance=3.0, view=_view(45, 3.0)), height=None, size=(480, 480),
         draw=gymnasium_frames,
     ),
     "mjviser's colours": VISER,

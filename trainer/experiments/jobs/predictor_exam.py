@@ -138,7 +138,7 @@ class Exam:
         begin = np.array([rng.integers(len(moves[i].actions) - whole + 1) for i in which])
         moments = list(zip(which, begin, strict=True))
         qpos, qvel = (np.stack([getattr(moves[i], n)[t] for i, t in moments]) for n in ("qpos", "qvel"))
-        strength, noise = rng.uniform(size=(count, 1)), HeldNoise(count)
+        strength, noise = rng.uniform(size=(count, 1)), HeldNoise(count, learner.robot.action_size)
         env = vector_env.make(learner.config.env, count, horizon=whole + 1, nthread=1)
         env.reset(seed=self._seed)
         env.set_states(np.arange(count), qpos, qvel, elapsed=np.zeros(count, np.int32))

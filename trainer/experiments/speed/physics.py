@@ -17,13 +17,14 @@ from mujoco import rollout
 
 from onedemo.core.cpu import cores
 from onedemo.experiments.speed.figures import Growth, Result, Skipped, by_turns, ratio
+from onedemo.robots.registry import robot_named
 from onedemo.sim import physics_profiling, vector_env
 from onedemo.sim.physics import load_model
 
 LANES = 64
 MISSING = "{} is not installed: pip install -e '.[bench]'"
 """Why a comparison was skipped."""
-_SPEC = vector_env.SPECS["hopper"]
+_SPEC = robot_named("hopper")
 _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 

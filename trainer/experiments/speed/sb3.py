@@ -178,7 +178,7 @@ class OursAsVecEnv(VecEnv):
     def __init__(self, lanes: int) -> None:
         self._env = vector_env.make("hopper", lanes, terminate_when_unhealthy=True)
         super().__init__(lanes, self._env.single_observation_space, self._env.single_action_space)
-        self._actions = np.zeros((lanes, self._env.env_spec.action_size))
+        self._actions = np.zeros((lanes, self._env.robot.action_size))
 
     def reset(self) -> np.ndarray:
         """Starts all lanes anew."""

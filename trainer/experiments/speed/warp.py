@@ -12,11 +12,11 @@ import numpy as np
 from onedemo.baselines.handcoded_trpo import HandcodedConfig, train_handcoded
 from onedemo.core.cpu import cores
 from onedemo.experiments.speed.figures import Figure, Growth, Result, Skipped, by_turns, single
-from onedemo.sim import vector_env
+from onedemo.robots.registry import robot_named
 from onedemo.sim.physics import Physics, RolloutPhysics, load_model
 
 LANES = (512, 2048, 8192, 32768)
-_SPEC = vector_env.SPECS["hopper"]
+_SPEC = robot_named("hopper")
 _CORES = cores()
 
 
@@ -107,7 +107,7 @@ def _rate_of(physics: Physics, motors: int, lanes: int, steps: int) -> Callable[
     rng = np.random.default_rng(0)
     state = np.zeros((lanes, 13))
     state[:, 2] = 1.25
-    state[:, 1:] += rng.uniform(-_SPEC.reset_noise, _SPEC.reset_noise, (lanes, 12))
+    state[:, 1:] += rng.uniform(-_SPEC.start.positions, _SPEC.start.positions, (lanes, 12))
     actions = rng.uniform(-1, 1, (16, lanes, motors))
 
     def run() -> float:
