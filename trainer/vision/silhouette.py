@@ -61,6 +61,8 @@ class Silhouette:
         self.held_out = np.asarray(tensors["held_out"], np.float64)
         """Explained share of the variance of each number on films held out, (A,)."""
         self._doubts = np.asarray(tensors["doubts"], np.float64)
+        self._swaps = np.asarray(tensors["swaps"], np.intp)
+        self._unit = bool(tensors["unit"])
         self._nets = [_Net(len(self.held_out)) for _ in range(MEMBERS)]
         for member, net in enumerate(self._nets):
             names = net.state_dict()
@@ -87,7 +89,8 @@ class Silhouette:
         robot in the pose that was read would cover other pixels.
         """
         with _one_thread():
-            each = np.stack([net.along(seen) for net in self._nets])
+            first, *others = [net.along(seen) for net in self._nets]
+            each = np.stack([first, *(_nearest(first, other, self._swaps) for other in others)])
             pose = each[..., : self._pose].mean(axis=0)
             drawn = np.mean([net.drawn(pose) for net in self._nets], axis=0)
         waves = pose[:, 1:].reshape(len(pose), -1, 2)
@@ -114,6 +117,7 @@ class Silhouette:
             found.masks, floor=found.floor, scale=found.scale, way=found.way, reach=self.reach, fps=fps
         )
         numbers, doubt = self.read(Views(crops=seen.crops[nearest], places=seen.places[nearest]))
+        numbers = _steady(numbers, self._swaps)
         at = np.stack([np.interp(times, looked, column) for column in numbers.T], axis=1)
         doubt = np.maximum(np.interp(times, looked, doubt), found.doubt)
         return at, np.where(seen.places[:, FOUND] > 0, doubt, 1.0)
@@ -123,7 +127,8 @@ class Silhouette:
         at, doubt = self.numbers(found, fps)
         pose, motion = at[:, : self._pose], at[:, self._pose : 2 * self._pose]
         waves = pose[:, 1:].reshape(len(pose), -1, 2)
-        waves = waves / np.maximum(np.linalg.norm(waves, axis=-1, keepdims=True), 1e-6)
+        lengths = np.linalg.norm(waves, axis=-1, keepdims=True)
+        waves = waves / np.maximum(lengths, 1e-6 if self._unit else 1.0)
         pose = np.concatenate([pose[:, :1], waves.reshape(len(pose), -1)], axis=1)
         return Track(
             pose=pose.astype(np.float32), motion=motion.astype(np.float32), doubt=doubt.astype(np.float32)
@@ -200,7 +205,9 @@ def _fit(shown: Films, check: Callable[[float], None], epochs: int) -> Silhouett
     crops, places, aims = (torch.from_numpy(x) for x in (shown.crops, shown.places, shown.aims))
     tensors: dict[str, np.ndarray] = {
         "reach": np.array(shown.reach), "held_out": np.zeros(size), "doubts": np.zeros(4),
+        "swaps": shown.swaps, "unit": np.array(_all_unit(shown.aims)),
     }  # fmt: skip
+    swaps = torch.from_numpy(shown.swaps)
     net = _Net(size)
     net.draw_weights(generator)
     for cycle in range(_CYCLES):
@@ -210,7 +217,7 @@ def _fit(shown: Films, check: Callable[[float], None], epochs: int) -> Silhouett
         for epoch in range(epochs):
             check((cycle + epoch / epochs) / _CYCLES)
             for index in torch.randperm(train, generator=generator).split(_BATCH):
-                loss = net.loss(crops[index], places[index], aims[index])
+                loss = net.loss(crops[index], places[index], aims[index], swaps)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -229,15 +236,57 @@ def _judged(tensors: Mapping[str, np.ndarray], shown: Films, train: int) -> Silh
         learned._signs(Views(crops=crops, places=places))
         for crops, places in zip(shown.crops[train:], shown.places[train:], strict=True)
     ]
-    error = np.square(np.stack([each.mean(axis=0) for each, _ in looked]) - aims)
+    read = [each.mean(axis=0) for each, _ in looked]
+    error = np.stack([_least_error(*pair, shown.swaps) for pair in zip(read, aims, strict=True)])
     spread = np.square(aims - aims.mean(axis=(0, 1))).mean(axis=(0, 1))
     size = (aims.shape[-1] - 2) // 2
     wrong = error[..., :size].mean(axis=-1).ravel() / spread[:size].mean()
     return Silhouette({
         **tensors,
-        "held_out": 1 - error.mean(axis=(0, 1)) / spread,
+        "held_out": 1 - error.mean(axis=(0, 1)) / np.maximum(spread, 1e-9),
         "doubts": _weights(np.concatenate([signs for _, signs in looked]), wrong),
     })  # fmt: skip
+
+
+def _least_error(read: np.ndarray, aims: np.ndarray, swaps: np.ndarray) -> np.ndarray:
+    """Squared errors of a film, (F, A), with limbs that are alike in the places that fit best."""
+    return min((np.square(read[:, order] - aims) for order in swaps), key=np.mean)
+
+
+def _nearest(to: np.ndarray, numbers: np.ndarray, swaps: np.ndarray) -> np.ndarray:
+    """Numbers of frames, (F, A), with limbs that are alike in each frame as they are most like others."""
+    if len(swaps) == 1:
+        return numbers
+    each = numbers[:, swaps]  # (F, k, A)
+    best = np.square(each - to[:, None]).sum(axis=-1).argmin(axis=1)
+    return each[np.arange(len(numbers)), best]
+
+
+def _steady(numbers: np.ndarray, swaps: np.ndarray) -> np.ndarray:
+    """Numbers of a video, (F, A), in which limbs that are alike change places as little as can be.
+
+    The likeliest way through the orders of all frames (Viterbi): what it costs is how far poses and rates, by
+    which limbs that cross are told apart, jump from frame to frame.
+    """
+    if len(swaps) == 1:
+        return numbers
+    each = numbers[:, swaps]  # (F, k, A)
+    jumps = np.linalg.norm(each[1:, :, None] - each[:-1, None], axis=-1)  # (F - 1, to, from)
+    cost, came = np.zeros(len(swaps)), []
+    for jump in jumps:
+        came.append((jump + cost).argmin(axis=1))
+        cost = (jump + cost).min(axis=1)
+    order = [int(cost.argmin())]
+    for step in reversed(came):
+        order.append(int(step[order[-1]]))
+    return np.take_along_axis(numbers, swaps[order[::-1]], axis=1)
+
+
+def _all_unit(aims: np.ndarray) -> bool:
+    """Whether the directions of limbs lie in the plane that is seen."""
+    size = (aims.shape[-1] - 2) // 2
+    waves = aims[..., 1:size].reshape(-1, 2)
+    return bool(np.abs(np.linalg.norm(waves, axis=-1) - 1).max() < 1e-3)
 
 
 def _weights(signs: np.ndarray, wrong: np.ndarray) -> np.ndarray:
@@ -289,12 +338,19 @@ class _Net(nn.Module):
             x = y if number == 0 else x + y
         return self.say(x.transpose(1, 2))
 
-    def loss(self, crops: torch.Tensor, places: torch.Tensor, aims: torch.Tensor) -> torch.Tensor:
-        """How wrong it is about films, and about what pixels the robot covers in the poses that they show."""
-        read = functional.mse_loss(self(crops, places), aims)
+    def loss(
+        self, crops: torch.Tensor, places: torch.Tensor, aims: torch.Tensor, swaps: torch.Tensor
+    ) -> torch.Tensor:
+        """How wrong it is about films, and about what pixels the robot covers in the poses that they show.
+
+        Limbs that are alike may have changed places in a film, but in all of it.
+        """
+        read = self(crops, places)
+        wrong = [(read - aims[..., order]).square().mean(dim=(1, 2)) for order in swaps]
         found = places[..., FOUND].flatten() > 0
         pose = aims[..., : (aims.shape[-1] - 2) // 2].flatten(0, 1)[found]
-        return read + functional.mse_loss(self.cover(pose), _coarse(crops.flatten(0, 1)[found]))
+        covered = functional.mse_loss(self.cover(pose), _coarse(crops.flatten(0, 1)[found]))
+        return torch.stack(wrong).amin(dim=0).mean() + covered
 
     def drawn(self, pose: np.ndarray) -> np.ndarray:
         """How far the robot in poses, (F, P), covers each part of the cut-out, as ``_coarse``."""

@@ -21,7 +21,7 @@ import numpy as np
 from onedemo.render.gl_context import open_context
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.robots.registry import robot_named
-from onedemo.robots.robot import Robot
+from onedemo.robots.robot import Robot, body_name, model_of
 from onedemo.sim.kinematics import body_of
 from onedemo.vision.silhouette_views import RATE, Views, views
 
@@ -37,6 +37,7 @@ _FILMS_EACH = 2
 """Of each random state and what comes of it."""
 _NEAR = 0.03
 """Metres above the ground at which contact is over."""
+_MOST_ORDERS = 4
 TRAVEL_SCALE = 0.4
 """A metre a second of travel counts as this many units of the pose."""
 
@@ -53,6 +54,8 @@ class Films:
     """What they show, (n, T, A), float32."""
     reach: float
     """Length of the robot stretched out, metres."""
+    swaps: np.ndarray
+    """As ``swaps_of``, (k, A)."""
 
 
 def aims(robot: Robot, qpos: np.ndarray, obs: np.ndarray) -> np.ndarray:
@@ -72,6 +75,57 @@ def names_of(robot: Robot) -> list[str]:
     limbs = [f"{robot.limbs[0]}'s side"] * (not body_of(robot).planar) + list(robot.limbs[1:])
     pose = ["height", *(f"{way} of {limb}" for limb in [robot.limbs[0], *limbs] for way in ("right", "up"))]
     return [*pose, *(f"rate of {number}" for number in pose), "travel", "contact"]
+
+
+def swaps_of(robot: Robot) -> np.ndarray:
+    """Orders of the numbers of ``aims`` that no silhouette tells apart, (k, A); the first is as they are.
+
+    A robot with two legs that are alike, one behind the other, looks the same if they change places.
+    """
+    model, body = model_of(robot.xml), body_of(robot)
+    orders = [list(range(model.nbody))]
+    for one in range(1, model.nbody):
+        for other in range(one + 1, model.nbody):
+            if len(orders) < _MOST_ORDERS and _alike(model, robot, one, other):
+                pairs = list(zip(_branch(model, one), _branch(model, other), strict=True))
+                changed = {a: b for a, b in pairs} | {b: a for a, b in pairs}
+                orders += [[changed.get(each, each) for each in order] for order in orders]
+    names = [body_name(model, each) for each in range(model.nbody)]
+    bodies = [names.index(name) for name in robot.limbs]
+    extra = int(not body.planar)  # the root has two axes
+    answer = []
+    for order in orders:
+        limbs = [bodies.index(order[each]) for each in bodies]
+        axes = [0] * extra + [limb + extra for limb in limbs]
+        pose = np.array([0, *(1 + 2 * axis + part for axis in axes for part in (0, 1))])
+        size = len(pose)
+        answer.append(np.concatenate([pose, size + pose, [2 * size, 2 * size + 1]]))
+    return np.stack(answer)
+
+
+def _branch(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all that hang on it."""
+    return [
+        body,
+        *(b for child in np.flatnonzero(model.body_parentid == body) for b in _branch(model, child)),
+    ]
+
+
+def _alike(model: mujoco.MjModel, robot: Robot, one: int, other: int) -> bool:
+    """Whether two bodies hang on the same one and look the same, with all that hangs on them."""
+    plane, branches = [robot.camera.right, robot.camera.up], (_branch(model, one), _branch(model, other))
+    if model.body_parentid[one] != model.body_parentid[other] or len(branches[0]) != len(branches[1]):
+        return False
+    for a, b in zip(*branches, strict=True):
+        geoms = [np.flatnonzero(model.geom_bodyid == each) for each in (a, b)]
+        if len(geoms[0]) != len(geoms[1]) or not np.allclose(
+            model.body_pos[a, plane], model.body_pos[b, plane], atol=0.01
+        ):
+            return False
+        for sizes in (model.geom_size, model.geom_pos[:, plane], np.float64(model.geom_type)[:, None]):
+            if not np.allclose(sizes[geoms[0]], sizes[geoms[1]], atol=0.01):
+                return False
+    return True
 
 
 def has_floor(robot: Robot) -> bool:
@@ -212,7 +266,7 @@ def films(env_name: str, count: int, seed: int, check: Callable[[float], None]) 
             seen.append(_seen(drawing, film, reach, rng))
     return Films(
         crops=np.stack([view.crops for view in seen]), places=np.stack([view.places for view in seen]),
-        aims=shown, reach=reach,
+        aims=shown, reach=reach, swaps=swaps_of(robot),
     )  # fmt: skip
 
 

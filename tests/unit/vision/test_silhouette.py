@@ -1,6 +1,7 @@
 """The pose from silhouettes: what is seen of masks, what is drawn to learn from, what a net makes of it."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,16 @@ from onedemo.sim import kinematics
 from onedemo.vision import learned_robots, silhouette
 from onedemo.vision.masks import Masks
 from onedemo.vision.silhouette import Silhouette, fit, learn
-from onedemo.vision.silhouette_pictures import FRAMES, Eye, Films, Silhouettes, aims, films, names_of
+from onedemo.vision.silhouette_pictures import (
+    FRAMES,
+    Eye,
+    Films,
+    Silhouettes,
+    aims,
+    films,
+    names_of,
+    swaps_of,
+)
 from onedemo.vision.silhouette_views import PLACES, SIDE, Views, views
 
 REACH = 1.6
@@ -136,7 +146,8 @@ def simple():
     pose = np.concatenate([height, np.stack([np.sin(lean), np.cos(lean)], -1)], -1)
     motion = np.gradient(pose, axis=1)
     numbers = [pose, motion, 2 * places[..., 3:4], 0.5 * height]
-    return Films(crops=crops, places=places, aims=np.concatenate(numbers, -1).astype(np.float32), reach=REACH)
+    shown = np.concatenate(numbers, -1).astype(np.float32)
+    return Films(crops=crops, places=places, aims=shown, reach=REACH, swaps=np.arange(8)[None])
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +184,7 @@ def test_doubt_is_about_the_error_and_grows_where_nothing_like_it_was_learned(le
 
 @pytest.mark.slow
 def test_the_same_films_give_the_same_nets_on_any_number_of_threads(simple):
-    few = Films(crops=simple.crops[:30], places=simple.places[:30], aims=simple.aims[:30], reach=REACH)
+    few = replace(simple, crops=simple.crops[:30], places=simple.places[:30], aims=simple.aims[:30])
     one = fit(few, epochs=1)
     torch.set_num_threads(2)
     two = fit(few, epochs=1)
@@ -189,6 +200,36 @@ def masks_of(crops, **more):
         "method": "still",
     }  # fmt: skip
     return Masks(masks=crops, **defaults | more)
+
+
+def test_limbs_that_are_alike_are_found_in_the_model():
+    assert len(swaps_of(robot_named("hopper"))) == len(swaps_of(robot_named("half-cheetah"))) == 1
+    walker = robot_named("walker2d")
+    names, (as_is, swapped) = names_of(walker), swaps_of(walker)
+    assert as_is.tolist() == list(range(len(names)))
+    moved = {names[a]: names[b] for a, b in enumerate(swapped) if a != b}
+    assert (
+        moved["right of thigh"] == "right of thigh_left"
+        and moved["rate of up of foot_left"] == "rate of up of foot"
+    )
+    assert "height" not in moved and "up of torso" not in moved and len(moved) == 24
+    assert len(swaps_of(robot_named("humanoid"))) == 4  # arms and legs
+
+
+def test_limbs_that_are_alike_keep_their_places_through_a_video():
+    """Two that cross, read with places changed in some frames."""
+    time = np.linspace(0, 2, 40)
+    angles, spins = np.stack([3 * time, 1 - time], axis=1), np.array([3.0, -1.0])
+    waves = np.stack([np.sin(angles), np.cos(angles)], axis=-1).reshape(40, 4)
+    rates = 0.15 * np.stack([np.cos(angles) * spins, -np.sin(angles) * spins], axis=-1).reshape(40, 4)
+    none = np.zeros((40, 1))
+    numbers = np.concatenate([none, waves, none, rates, none, none], axis=1)
+    swaps = np.array([range(12), [0, 3, 4, 1, 2, 5, 8, 9, 6, 7, 10, 11]])
+    rng = np.random.default_rng(0)
+    mixed = np.where(rng.random((40, 1)) < 0.4, numbers[:, swaps[1]], numbers)
+    steady = silhouette._steady(mixed, swaps)
+    assert min(np.abs(steady - numbers[:, order]).max() for order in swaps) == 0
+    assert np.abs(mixed - numbers).max() > 0.5
 
 
 def test_a_video_of_another_frame_rate_and_with_nothing_in_it(learned):
