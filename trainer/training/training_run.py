@@ -203,7 +203,7 @@ class TrainingRun:
         """What the demo shows of the robot in another look; None if it shows another body."""
         shapes = silhouette.learn(self.config.env, self._cache_dir / "robots", note)
         self.preparing = "The robot is looked for in the demonstration video."
-        return shapes.known_track(masks_of(self.demo, shapes.reach), self.demo.fps)
+        return shapes.track(masks_of(self.demo, shapes.reach), self.demo.fps)
 
     def looking(self) -> tuple[float | None, float | None]:
         """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.

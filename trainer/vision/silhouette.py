@@ -22,7 +22,7 @@ from torch.nn import functional
 from onedemo.vision import learned_robots
 from onedemo.vision.masks import Masks
 from onedemo.vision.pose_estimator import Track
-from onedemo.vision.silhouette_pictures import Films, films
+from onedemo.vision.silhouette_pictures import TRAVEL_SCALE, Films, films
 from onedemo.vision.silhouette_views import FOUND, PLACES, RATE, SIDE, Views, views
 
 VERSION = 1
@@ -119,26 +119,28 @@ class Silhouette:
         numbers, doubt = self.read(Views(crops=seen.crops[nearest], places=seen.places[nearest]))
         numbers = _steady(numbers, self._swaps)
         at = np.stack([np.interp(times, looked, column) for column in numbers.T], axis=1)
-        doubt = np.maximum(np.interp(times, looked, doubt), found.doubt)
-        return at, np.where(seen.places[:, FOUND] > 0, doubt, 1.0)
+        return at, np.where(seen.places[:, FOUND] > 0, np.interp(times, looked, doubt), 1.0)
 
-    def track(self, found: Masks, fps: float) -> Track:
-        """Pose, motion, travel and contact in the frames of a video; arguments as of ``numbers``."""
+    def track(self, found: Masks, fps: float) -> Track | None:
+        """Pose, motion, travel and contact in the frames of a video; None if it shows another body.
+
+        Arguments as of ``numbers``. The doubt is also that of the masks.
+        """
         at, doubt = self.numbers(found, fps)
+        if np.median(doubt) > _ANOTHER:
+            return None
+        doubt = np.maximum(doubt, found.doubt)
         pose, motion = at[:, : self._pose], at[:, self._pose : 2 * self._pose]
         waves = pose[:, 1:].reshape(len(pose), -1, 2)
         lengths = np.linalg.norm(waves, axis=-1, keepdims=True)
         waves = waves / np.maximum(lengths, 1e-6 if self._unit else 1.0)
         pose = np.concatenate([pose[:, :1], waves.reshape(len(pose), -1)], axis=1)
+        stands = np.isfinite(found.floor).any()
         return Track(
-            pose=pose.astype(np.float32), motion=motion.astype(np.float32), doubt=doubt.astype(np.float32)
-        )
-
-    def known_track(self, found: Masks, fps: float) -> Track | None:
-        """The track of a video of this robot; None of one that shows another body, by its doubt."""
-        track = self.track(found, fps)
-        assert track.doubt is not None
-        return track if np.median(track.doubt) < _ANOTHER else None
+            pose=pose.astype(np.float32), motion=motion.astype(np.float32),
+            travel=None if found.way is None else np.float32(at[:, -2] / TRAVEL_SCALE),
+            contact=np.float32(np.clip(at[:, -1], 0, 1)) if stands else None, doubt=doubt.astype(np.float32),
+        )  # fmt: skip
 
     @property
     def _pose(self) -> int:

@@ -1,17 +1,23 @@
 """The pose from silhouettes: what is seen of masks, what is drawn to learn from, what a net makes of it."""
 
 import logging
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.small_world import FRAME_STEPS, falling_states
+from helpers.small_world import FRAME_STEPS, Thumbnail, falling_states, small_config
+from onedemo.demos.library import find_demo
 from onedemo.robots.registry import robot_named
 from onedemo.sim import kinematics
+from onedemo.storage.store import Store
+from onedemo.training.runs import add_run
+from onedemo.training.training_run import TrainingRun
 from onedemo.vision import learned_robots, silhouette
 from onedemo.vision.masks import Masks
+from onedemo.vision.pose_estimator import shipped_track
 from onedemo.vision.silhouette import Silhouette, fit, learn
 from onedemo.vision.silhouette_pictures import (
     FRAMES,
@@ -240,9 +246,14 @@ def test_a_video_of_another_frame_rate_and_with_nothing_in_it(learned):
     np.testing.assert_allclose(fast[10:50:2], plain[5:25], atol=0.1)
     unsure = learned.track(masks_of(masks, doubt=np.full(30, 0.9)), 30.0)
     assert (unsure.doubt >= 0.9).all()
-    nothing = learned.track(masks_of(np.zeros_like(masks)), 30.0)
-    assert (nothing.doubt == 1).all() and np.isfinite(nothing.pose).all()
-    waves = learned.track(masks_of(masks), 30.0).pose[:, 1:]
+    assert learned.track(masks_of(np.zeros_like(masks)), 30.0) is None
+    nothing, doubt = learned.numbers(masks_of(np.zeros_like(masks)), 30.0)
+    assert (doubt == 1).all() and np.isfinite(nothing).all()
+    blind = learned.track(masks_of(masks, way=None, floor=np.full(30, np.nan)), 30.0)
+    assert blind.travel is None and blind.contact is None
+    whole = learned.track(masks_of(masks), 30.0)
+    assert whole.travel.shape == whole.contact.shape == (30,)
+    waves = whole.pose[:, 1:]
     np.testing.assert_allclose(np.linalg.norm(waves, axis=1), 1, atol=1e-5)
 
 
@@ -264,6 +275,23 @@ def test_what_was_learned_is_kept_by_the_model(tmp_path, monkeypatch, caplog):
 
 
 # What comes with the program
+
+
+def test_a_built_in_demo_is_known_without_a_look_at_the_robot(tmp_path):
+    def stop(*args):
+        raise AssertionError("the robot is looked at")
+
+    demo = find_demo("hopper-hop", tmp_path / "demos")
+    config = small_config(method="onedemo", predictor__appearance=True)
+    with closing(Store(tmp_path)) as store:
+        add_run(store, tmp_path, demo, config, name="r")
+        training = TrainingRun(
+            store=store, data_dir=tmp_path, run="r", demo=demo, config=config, encoder=Thumbnail(),
+            learn_robot=stop,
+        )  # fmt: skip
+        features, track = training.look()
+    assert len(features) == demo.frames
+    np.testing.assert_array_equal(track.pose, shipped_track(demo).pose)
 
 
 def test_a_known_robot_is_read_at_once_from_a_small_file(tmp_path):
