@@ -41,8 +41,10 @@ from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles, tidy
 from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Clip, Demo, Rollouts
+from onedemo.vision import silhouette
 from onedemo.vision.encoders import Encoder, demo_features
-from onedemo.vision.pose_estimator import PoseEstimator, Track
+from onedemo.vision.mask_file import masks_of
+from onedemo.vision.pose_estimator import PoseEstimator, Track, shipped_track
 from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 _TIDY_S = 10.0
@@ -182,6 +184,8 @@ class TrainingRun:
         features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
         if not self.config.predictor.appearance:
             return features, None
+        if (track := shipped_track(self.demo)) is not None:
+            return features, track
         began = time.monotonic()
 
         def note(share: float = 0.0) -> None:  # never called if it was learned before
@@ -191,9 +195,17 @@ class TrainingRun:
 
         try:
             look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", note)
+            if look.knows(features):
+                return features, look.track(features, self.demo.fps)
+            return features, self._by_silhouette(note)
         finally:
             self._learning = None
-        return features, look.track(features, self.demo.fps) if look.knows(features) else None
+
+    def _by_silhouette(self, note: Callable[[float], None]) -> Track | None:
+        """What the demo shows of the robot in another look; None if it shows another body."""
+        shapes = silhouette.learn(self.config.env, self._cache_dir / "robots", note)
+        self.preparing = "The robot is looked for in the demonstration video."
+        return shapes.track(masks_of(self.demo, shapes.reach), self.demo.fps)
 
     def looking(self) -> tuple[float | None, float | None]:
         """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.

@@ -10,9 +10,7 @@ Shapes: n pictures, F demo frames, D frame features, P = 9 numbers of a pose (``
 
 from __future__ import annotations
 
-import hashlib
 import io
-import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +21,12 @@ from torch import nn
 from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
-from onedemo.core.names import check_name
 from onedemo.render.render_thread import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.robots.registry import robot_named
 from onedemo.sim.kinematics import HEIGHT_SCALE, body_of
 from onedemo.types import Demo
+from onedemo.vision import learned_robots
 from onedemo.vision.encoders import Encoder
 
 _SEED = 20_000
@@ -47,7 +45,6 @@ _AROUND = 2
 """Frames before and after over which a speed is taken."""
 _STRANGE = 10.0
 """Videos of the robot have 1.0 to 1.1, a video of a person thousands."""
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,6 +55,10 @@ class Track:
     """(F, P), float32, as ``body.pose``."""
     motion: np.ndarray
     """(F, P), float32, as ``body.motion``."""
+    travel: np.ndarray | None = None
+    """Velocity of the root to the right, m/s, (F,), float32, as ``body.travel``; None: not known."""
+    contact: np.ndarray | None = None
+    """How far it touches the ground, 0..1, (F,), float32, as ``body.contact``; None: not known."""
     doubt: np.ndarray | None = None
     """How unsure the pose is, (F,), float32: 0 is sure, 1 may be any; None: not said."""
 
@@ -120,15 +121,19 @@ def shipped_track(demo: Demo) -> Track | None:
     if (data := read_whole(_track_file(demo))) is None:
         return None
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        return Track(pose=stored["pose"], motion=stored["motion"], doubt=stored["doubt"])
+        return Track(**{name: stored[name] for name in _KEPT if name in stored.files})
 
 
 def keep_track(demo: Demo, track: Track) -> None:
     """Keeps what a demo shows of the robot beside its video."""
     assert track.doubt is not None, "the pose estimator says how sure it is"
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, pose=track.pose, motion=track.motion, doubt=track.doubt)
+    known = {name: x for name in _KEPT if (x := getattr(track, name)) is not None}
+    np.savez_compressed(buffer, allow_pickle=False, **known)
     write_atomic(_track_file(demo), buffer.getvalue())
+
+
+_KEPT = ("pose", "motion", "travel", "contact", "doubt")
 
 
 def _track_file(demo: Demo) -> Path:
@@ -148,7 +153,7 @@ def learn(
     Args:
         env_name: The robot.
         encoder: Looks at the pictures.
-        cache_dir: Where it is kept, by robot and encoder.
+        cache_dir: Where it is kept, by robot and encoder; what comes with the program is not kept again.
         check: Called every now and then with the share that is done; what it raises ends the learning.
         count: Pictures to learn from, where it is not known yet.
         epochs: Passes over them.
@@ -156,16 +161,11 @@ def learn(
     Raises:
         UserError: If this machine cannot draw.
     """
-    spec = robot_named(env_name)
-    model = hashlib.sha256(spec.xml.read_bytes()).hexdigest()[:12]
-    path = cache_dir / f"{check_name(env_name)}-{model}-{encoder.name}-v{_VERSION}.npz"
-    if (data := read_whole(path)) is not None:
-        with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-            return PoseEstimator(stored)
+    name = f"{learned_robots.model_name(env_name)}-{encoder.name}-v{_VERSION}"
+    if (known := learned_robots.find(name, cache_dir)) is not None:
+        return PoseEstimator(known)
     appearance = regress(*pictures(env_name, encoder, count, check), check, epochs=epochs)
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **appearance.tensors)
-    write_atomic(path, buffer.getvalue())
+    learned_robots.keep(name, cache_dir, appearance.tensors)
     return appearance
 
 
