@@ -18,7 +18,9 @@ import cv2
 import numpy as np
 
 from onedemo.render.mover import is_studio, solid_in_studio, way_in_studio
-from onedemo.render.renderer import CAMERA_HEIGHT, FREE_ABOVE, studio
+from onedemo.render.renderer import studio
+from onedemo.render.stage import free_above
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.vision.mask_camera import Motion, follow_background
 from onedemo.vision.mask_cut import Colours, boxed, clicked, cut, seeds_of
 from onedemo.vision.mask_evidence import before_moving, before_still
@@ -154,11 +156,12 @@ def boxes_of(masks: np.ndarray) -> np.ndarray:
 
 def _in_studio(frames: np.ndarray) -> Masks:
     height, width = frames.shape[1:3]
-    view = studio(width, height)
+    camera = robot_named(DEFAULT).camera
+    view = studio(width, height, camera)
     solids = np.stack([solid_in_studio(frame) for frame in frames])
     masks = solids.astype(bool)
     floor = np.full(len(frames), height + view.bottom * view.scale)
-    top = height - (CAMERA_HEIGHT + FREE_ABOVE - 0.03 - view.bottom) * view.scale
+    top = height - (camera.height + free_above(camera) - 0.03 - view.bottom) * view.scale
     floor[boxes_of(masks)[:, 1] < top] = np.nan  # the camera rises with the robot
     return Masks(
         masks=masks, floor=floor, scale=view.scale, way=way_in_studio(frames, solids),
