@@ -139,6 +139,7 @@ const drawing = (() => {
 
   // At the top right, where there is neither a caption nor the floor.
   function drawPace({ pen, width, unit }, pace) {
+    if (width < 165 * unit) return; // the caption has all the room
     const word = { 1: "1×", 0.5: "½×", 0.25: "¼×" }[pace];
     pen.font = `600 ${12 * unit}px system-ui, sans-serif`;
     pen.fillStyle = "rgb(255 255 255 / 72%)";

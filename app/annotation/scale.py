@@ -15,7 +15,7 @@ MEANINGS = (
 REASONS = ("I cannot see enough", "It is too short to tell", "The picture is broken")
 """Why a clip may be skipped."""
 
-PAIR_REASONS = ("I cannot see enough", "They are too short to tell", "A picture is broken")
+PAIR_REASONS = ("I cannot see enough", "Too short to tell", "A picture is broken")
 """Why a pair may be skipped."""
 
 WORDS = (
