@@ -38,7 +38,7 @@ def add(
         rotate: Turn it clockwise: 90, 180 or 270 degrees.
         stabilise: Hold the background still.
         crop: Keep this rectangle: X,Y,W,H in pixels, once it is turned.
-        track: Let the rectangle follow what moves; without --crop it is as large as that asks for.
+        track: Let the rectangle follow what moves in it at first; without --crop, all that moves.
         mirror: Swap left and right.
         speed: Play it so many times faster, 0.1 to 20: the video shows the move slowed.
         reverse: Play it backwards.

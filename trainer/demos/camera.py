@@ -2,8 +2,8 @@
 
 A video is gone through once, small (``Survey``); then each of its pictures is cut (``View``).
 
-Shapes: n pictures, k points, H rows, W columns; pictures are uint8 RGB. Places are pixels from the upper left
-corner, and so are the 3 x 3 matrices, which map the pixels of a picture to those of the first.
+Shapes: n pictures, m of them that are surveyed for what moves, H rows, W columns; pictures are uint8 RGB.
+Places are pixels from the upper left corner; a motion maps those of a picture to those of the first.
 """
 
 from __future__ import annotations
@@ -15,6 +15,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from onedemo.demos.frame_geometry import (
+    Box,
+    angle_and_shift,
+    inner_edges,
+    motion,
+    overlap,
+    resized,
+    scaled,
+)
 from onedemo.demos.import_checks import MIN_SIDE
 from onedemo.errors import UserError
 
@@ -37,14 +46,17 @@ _STILL = 0.5
 """Pixels: a background that moves less stands still."""
 _LEAST_LEFT = 0.5
 """Of each side of the picture, once its edges are gone."""
-_Box = tuple[int, int, int, int]
+_OTHER = 30
+"""Difference of a colour from the background's, of 255, that something before it makes."""
+_LEAST_SEEN = 0.7
+"""Share of the pictures in which what moves is seen."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class View:
     """What of each picture is wanted."""
 
-    box: _Box | None = None
+    box: Box | None = None
     """x, y, width, height; the first two only where nothing is followed. None: all of it."""
     times: np.ndarray | None = None
     """Of the pictures that were surveyed, seconds, (n,)."""
@@ -63,7 +75,7 @@ class View:
         if self.poses is None:
             return picture[y : y + height, x : x + width]
         shift = np.array([[1.0, 0, -x], [0, 1, -y], [0, 0, 1]])
-        moved = (shift @ _matrix(*self._at(seconds, self.poses)))[:2]
+        moved = (shift @ motion(*self._at(seconds, self.poses)))[:2]
         return cv2.warpAffine(
             np.ascontiguousarray(picture), moved, (width, height), flags=cv2.INTER_CUBIC,
             borderMode=cv2.BORDER_REPLICATE,
@@ -80,14 +92,14 @@ class Survey:
     Args:
         name: What sentences call the video.
         size: Width and height of its pictures.
-        crop: x, y, width, height of the part that is wanted; None: all, or as large as what moves asks for.
-        track: Whether the crop follows what moves.
+        crop: x, y, width, height of the part that is wanted; None: all.
+        track: Whether the crop follows what moves in it at first; without one, whatever moves.
         stabilise: Whether the background is held still.
         speed: Seconds of the video that one second shows.
     """
 
     def __init__(
-        self, name: str, size: tuple[int, int], *, crop: _Box | None, track: bool, stabilise: bool,
+        self, name: str, size: tuple[int, int], *, crop: Box | None, track: bool, stabilise: bool,
         speed: float,
     ) -> None:  # fmt: skip
         self._name, self._size, self._crop, self._track, self._speed = name, size, crop, track, speed
@@ -106,11 +118,11 @@ class Survey:
         number = len(self._times)
         self._times.append(seconds)
         if self._background is not None:
-            small = _scaled(picture, _HELD_SIDE)
+            small = scaled(picture, _HELD_SIDE)
             pose = self._background.find(seconds, cv2.cvtColor(small, cv2.COLOR_RGB2GRAY))
-            self._poses.append(_resized(pose, small.shape, picture.shape))
+            self._poses.append(resized(pose, small.shape, picture.shape))
         if self._track and number % self._every == 0:
-            self._small.append((number, _scaled(picture, _SMALL_SIDE)))
+            self._small.append((number, scaled(picture, _SMALL_SIDE)))
             if len(self._small) > _MOST_SMALL:
                 self._every *= 2
                 self._small = self._small[::2]
@@ -129,7 +141,7 @@ class Survey:
             room = _left(self._poses, self._size, self._name)
         times = np.array(self._times)
         if not self._track:
-            box = _overlap(room, self._crop) if self._crop else room
+            box = overlap(room, self._crop) if self._crop else room
             if min(box[2:]) < MIN_SIDE:
                 raise UserError(
                     f"--crop {','.join(map(str, self._crop or ()))} leaves nothing of {self._name} once its "
@@ -147,13 +159,13 @@ class Survey:
 
     def _held(self, warn: Callable[[str], object]) -> np.ndarray | None:
         """The poses of all pictures, (n, 3); None if the background stands still as it is."""
-        poses = np.array([_angle_and_shift(pose) for pose in self._poses])
-        if np.abs(_edges(self._poses, self._size) - _edges([np.eye(3)], self._size)).max() < _STILL:
+        poses = np.array([angle_and_shift(pose) for pose in self._poses])
+        if np.abs(inner_edges(self._poses, self._size) - inner_edges([np.eye(3)], self._size)).max() < _STILL:
             warn("the background stands still as it is, so --stabilise changes nothing")
             return None
         return poses
 
-    def _mover(self, room: _Box, poses: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def _mover(self, room: Box, poses: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Left, top, right and bottom of what moves, (m, 4), in the pictures of these numbers, (m,)."""
         from onedemo.render.mover import locate  # with it comes MuJoCo, for the studio's measures
 
@@ -164,18 +176,24 @@ class Survey:
         pictures = []
         for number, small in self._small:
             if poses is not None:
-                moved = _resized(_matrix(*poses[number]), self._size[::-1], shape)
+                moved = resized(motion(*poses[number]), self._size[::-1], shape)
                 small = cv2.warpAffine(small, moved[:2], shape[1::-1], borderMode=cv2.BORDER_REPLICATE)
             pictures.append(small[top:bottom, left:right])
         self._small, numbers = [], np.array([number for number, _ in self._small])
-        mover = locate(np.stack(pictures))
-        if mover is None:
+        all_of_them, boxes = np.stack(pictures), None
+        if self._crop is not None:
+            begin = (np.array(self._crop).reshape(2, 2) * by - [[left, top], [0, 0]]).ravel()
+            boxes = _in_rectangle(all_of_them, begin)
+        elif (mover := locate(all_of_them)) is not None:
+            boxes = mover.box
+        if boxes is None:
+            where = f"the rectangle of --crop at the beginning of {self._name}" if self._crop else self._name
             others = "" if self._background else "add --stabilise if the camera shakes, "
             raise UserError(
-                f"--track finds nothing in {self._name} that moves before a background that stands still; "
-                f"{others}choose another part with --start and --end, or use --crop alone"
+                f"--track finds nothing in {where} that moves before a background that stands still; "
+                f"{others}choose another part with --start and --end, or leave it out"
             )
-        return (mover.box + np.array([left, top, left, top])) / np.tile(by, 2), numbers
+        return (boxes + np.array([left, top, left, top])) / np.tile(by, 2), numbers
 
 
 class _Background:
@@ -238,13 +256,43 @@ class _Background:
         zoom = math.hypot(matrix[0, 0], matrix[1, 0])
         if len(now) < _FEWEST_POINTS or np.ptp(now[:, 0]) < _SPREAD * grey.shape[1] or abs(zoom - 1) > 0.1:
             return None, 0.0
-        turn = _matrix(math.atan2(matrix[1, 0], matrix[0, 0]), 0, 0)
+        turn = motion(math.atan2(matrix[1, 0], matrix[0, 0]), 0, 0)
         turn[:2, 2] = (before - now @ turn[:2, :2].T).mean(axis=0)
         return turn, len(now) / len(self._points)
 
 
+def _in_rectangle(pictures: np.ndarray, rectangle: np.ndarray) -> np.ndarray | None:
+    """What moves in a rectangle at first, and then in one around where it was last: others are left alone.
+
+    Args:
+        pictures: (m, H, W, 3).
+        rectangle: x, y, width, height.
+
+    Returns:
+        Left, top, right, bottom in each picture, (m, 4); None if it is seen in too few.
+    """
+    background = np.median(pictures[:: max(1, len(pictures) // 48)], axis=0).astype(np.uint8)
+    middle, half = rectangle[:2] + rectangle[2:] / 2, rectangle[2:] / 2
+    boxes = np.full((len(pictures), 4), np.nan)
+    for box, picture in zip(boxes, pictures, strict=True):
+        other = (cv2.absdiff(picture, background).max(axis=2) > _OTHER).astype(np.uint8)
+        other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        places = np.argwhere(other)[:, ::-1] + 0.5
+        for _ in range(4):  # to where most of it is
+            inside = places[(np.abs(places - middle) <= half).all(axis=1)]
+            if len(inside) < max(6, 0.02 * 4 * half.prod()):
+                break
+            middle = inside.mean(axis=0)
+            box[:2], box[2:] = np.percentile(inside, [2, 98], axis=0)
+    seen = ~np.isnan(boxes[:, 0])
+    if seen.mean() < _LEAST_SEEN:
+        return None
+    numbers = np.arange(len(boxes))
+    return np.stack([np.interp(numbers, numbers[seen], side[seen]) for side in boxes.T], axis=1)
+
+
 def _follow(
-    times: np.ndarray, boxes: np.ndarray, room: _Box, size: tuple[int, int] | None, calm: float
+    times: np.ndarray, boxes: np.ndarray, room: Box, size: tuple[int, int] | None, calm: float
 ) -> tuple[tuple[int, int], np.ndarray]:
     """A crop that goes along with what moves.
 
@@ -295,9 +343,9 @@ def _calmed(times: np.ndarray, values: np.ndarray, calm: float) -> np.ndarray:
     return np.where(flat, sums / total, line)
 
 
-def _left(matrices: list[np.ndarray], size: tuple[int, int], name: str) -> _Box:
+def _left(matrices: list[np.ndarray], size: tuple[int, int], name: str) -> Box:
     """What of the first picture all pictures show, upright; raises UserError if it is too little."""
-    (left, top), (right, bottom) = _edges(matrices, size)
+    (left, top), (right, bottom) = inner_edges(matrices, size)
     width, height = size
     x, y = max(0, math.ceil(left)), max(0, math.ceil(top))
     box = (x, y, min(width, math.floor(right)) - x, min(height, math.floor(bottom)) - y)
@@ -307,40 +355,3 @@ def _left(matrices: list[np.ndarray], size: tuple[int, int], name: str) -> _Box:
             f"{name}, as its camera goes so far; choose a part with --start and --end, or leave it out"
         )
     return box
-
-
-def _edges(matrices: np.ndarray | list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
-    """The innermost left and top, right and bottom edge of pictures where they lie in the first, (2, 2)."""
-    width, height = size
-    corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
-    x, y = np.moveaxis((np.asarray(matrices) @ corners)[:, :2], 1, 0)  # (n, 4) each
-    return np.array([[x[:, [0, 2]].max(), y[:, [0, 1]].max()], [x[:, [1, 3]].min(), y[:, [2, 3]].min()]])
-
-
-def _overlap(one: _Box, other: _Box) -> _Box:
-    x, y = max(one[0], other[0]), max(one[1], other[1])
-    return x, y, min(one[0] + one[2], other[0] + other[2]) - x, min(one[1] + one[3], other[1] + other[3]) - y
-
-
-def _matrix(angle: float, x: float, y: float) -> np.ndarray:
-    cosine, sine = math.cos(angle), math.sin(angle)
-    return np.array([[cosine, -sine, x], [sine, cosine, y], [0, 0, 1]])
-
-
-def _angle_and_shift(matrix: np.ndarray) -> tuple[float, float, float]:
-    return math.atan2(matrix[1, 0], matrix[0, 0]), float(matrix[0, 2]), float(matrix[1, 2])
-
-
-def _resized(matrix: np.ndarray, now: tuple[int, ...], wanted: tuple[int, ...]) -> np.ndarray:
-    """The matrix of pictures of one shape (H, W) for the same pictures of another."""
-    x, y = wanted[1] / now[1], wanted[0] / now[0]
-    scale = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])  # the middle of a pixel is whole
-    return scale @ matrix @ np.linalg.inv(scale)
-
-
-def _scaled(picture: np.ndarray, side: int) -> np.ndarray:
-    """A picture whose longer side is at most so many pixels."""
-    height, width = picture.shape[:2]
-    by = min(1.0, side / max(height, width))
-    size = (max(1, round(width * by)), max(1, round(height * by)))
-    return cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_AREA)

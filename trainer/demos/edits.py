@@ -35,7 +35,7 @@ class Options:
     end: float | None = None
     """Seconds."""
     crop: tuple[int, int, int, int] | None = None
-    """x, y, width, height, pixels of the upright, turned source; with ``track`` only the size counts."""
+    """x, y, width, height, pixels of the upright, turned source; with ``track`` where it begins."""
     mirror: bool = False
     """Swap left and right."""
     fps: float = 30.0
@@ -49,7 +49,7 @@ class Options:
     rotate: int = 0
     """Degrees clockwise, of ``QUARTERS``."""
     track: bool = False
-    """A crop of fixed size follows what moves."""
+    """A crop of fixed size follows what moves: what moves in ``crop`` at first, or all that moves."""
     stabilise: bool = False
     """The background stands still."""
 

@@ -80,7 +80,7 @@ def import_video(
         reverse: Play it backwards.
         loop: How many times it is shown, end to end; 0: as often as fits into 8 s.
         rotate: Degrees clockwise: 0, 90, 180 or 270.
-        track: Let a crop of fixed size follow what moves; of ``crop`` then only the size counts.
+        track: Let a crop of fixed size follow what moves: ``crop`` what moves in it at first.
         stabilise: Hold the background still.
         task: The hand-coded reward that describes the move, if known.
         source: Where the video is from; its file name if empty.

@@ -198,13 +198,33 @@ def test_a_crop_follows_what_moves_and_never_leaves_the_picture(tmp_path):
     assert np.ptp(still[:, 0]) > 0.7
 
 
+def test_a_rectangle_follows_what_moves_in_it_and_nobody_else(tmp_path):
+    """A passer-by in black goes the other way, and behind the figure."""
+    pictures = []
+    for n, (x, y) in enumerate(walk(60)):
+        picture = room_with(None)
+        at = round(300 - 280 * n / 59)
+        picture[130:200, at - 10 : at + 10] = 10
+        picture[round(y) - 30 : round(y) + 30, round(x) - 12 : round(x) + 12] = 230, 20, 20
+        pictures.append(picture)
+    path = film(tmp_path / "two.mp4", pictures)
+    frames = shaped(path, track=True, crop=(5, 90, 80, 110))
+    assert frames[0].shape == (110, 80, 3)
+    places = np.array([centre_of(frame)[0] for frame in frames])
+    assert np.abs(places[8:-8] - 0.5).max() < 0.16  # a little drawn along where both meet
+    assert np.abs(places[[10, 15, 45, 50]] - 0.5).max() < 0.06
+    assert "in the rectangle of --crop at the beginning of two.mp4" in refused(
+        path, track=True, crop=(130, 0, 60, 60)
+    )
+
+
 def test_a_following_crop_has_the_size_of_the_rectangle_and_calm(tmp_path):
     """It is as large as asked; a place that is told a little wrong each time does not shake it."""
     rng = np.random.default_rng(1)
     places = [(x + rng.uniform(-3, 3), y) for x, y in walk(90)]
     path = film(tmp_path / "walk.mp4", [room_with(place) for place in places])
-    frames = shaped(path, track=True, crop=(0, 0, 100, 80))
-    assert frames[0].shape == (80, 100, 3)
+    frames = shaped(path, track=True, crop=(0, 100, 100, 90))
+    assert frames[0].shape == (90, 100, 3)
     at = np.array([centre_of(frame)[0] * 100 for frame in frames]) - [x for x, _ in places]
     assert np.abs(np.diff(at, 2))[8:-8].max() < 3  # of the crop's left edge; the figure itself shakes by 12
 
