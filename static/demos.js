@@ -42,6 +42,7 @@ const demos = (() => {
     part("steps").dataset.at = step;
     if (step !== "part") part("video").pause();
     if (step !== "result") part("result").pause();
+    if (step !== "result") moves.end(); // static/mask.js
   }
 
   const say = (text, bad = false) => {
@@ -369,6 +370,7 @@ const demos = (() => {
         ...told.map((text) => Object.assign(document.createElement("li"), { textContent: text })),
       );
       show("result");
+      moves.begin(dialog, of.upload, facts);
       part("result").play().catch(() => {});
       part("name").focus();
     } catch (error) {
