@@ -19,6 +19,9 @@ const demos = (() => {
       wanted = demoPart(part, { upright, moved });
       preview = demoResult(part, { bring, place });
       listen();
+      dialog.addEventListener("demo-result", ({ detail }) => {
+        moves.begin(dialog, upload.upload, detail.facts, part("result").src);
+      });
       begin();
     }
     dialog.showModal();
@@ -40,6 +43,7 @@ const demos = (() => {
     part("steps").dataset.at = step;
     if (step !== "part") part("video").pause();
     if (step !== "result") part("result").pause();
+    if (step !== "result") moves.end(); // static/mask.js
   }
 
   const say = (text, bad = false) => {

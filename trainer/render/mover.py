@@ -129,7 +129,7 @@ def solid_in_studio(frame: np.ndarray) -> np.ndarray:
     red, green, blue = cv2.split(frame)
     bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
     solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
-    return cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return cv2.medianBlur(solid, 3)
 
 
 def way_in_studio(frames: np.ndarray, solids: np.ndarray, camera: Camera | None = None) -> np.ndarray:
