@@ -442,6 +442,7 @@ def _demo(about: dict[str, Any], video: Path) -> Demo:
         width=int(about["width"]),
         height=int(about["height"]),
         task=str(about.get("task", "")),
+        robot=str(about.get("robot", "")),
         source=str(about.get("source", "")),
     )
 
