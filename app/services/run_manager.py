@@ -18,7 +18,7 @@ from onedemo.core.log_limit import LogLimit
 from onedemo.core.names import check_description
 from onedemo.demos.library import find_demo, list_demos
 from onedemo.errors import UserError
-from onedemo.render.renderer import Drawing
+from onedemo.render.render_thread import Drawing
 from onedemo.reward.model import Snapshot, check_start
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.run_directory import RunDirectory

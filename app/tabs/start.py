@@ -58,6 +58,7 @@ class Start:
         self._context, self._store, self._run = context, context.store, context.run
         self._shown = False
         self._looked_at = -_EVERY_S
+        self._left_out: set[int] = set()
         self._content: dict[int, str] = {}
         self._iteration = 0
         self._best: dict[str, Any] | None = None
@@ -79,14 +80,18 @@ class Start:
 
     def refresh(self, status: Status) -> None:
         """Steps and people, if somebody looks."""
-        if not self._shown or time.monotonic() - self._looked_at < _EVERY_S:
+        if not self._shown:
             return
-        self._looked_at = time.monotonic()
         store, run = self._store, self._run
+        left_out = store.ratings.left_out(run)
+        # Who is excluded or included is seen at once: somebody has pressed a button and waits.
+        if left_out == self._left_out and time.monotonic() - self._looked_at < _EVERY_S:
+            return
+        self._looked_at, self._left_out = time.monotonic(), left_out
         given: Counter[str] = Counter()
         for (name, _), counts in store.ratings.tallies(run).items():
             given[name] += sum(counts)
-        everybody, left_out = store.accounts.raters(), store.ratings.left_out(run)
+        everybody = store.accounts.raters()
         people = people_of(
             everybody, store.accounts.links(), store.accounts.presence(), given, left_out,
             now=datetime.fromisoformat(now()),

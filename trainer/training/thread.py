@@ -51,6 +51,7 @@ class Trainer:
         self._training = training
         self.store, self.run, self.demo = training.store, training.run, training.demo
         self.config, self.data_dir, self.dt = training.config, training.data_dir, training.dt
+        self.robot = training.robot
         self.directory = training.files.path
         self.acting = training.acting
         self.want_pairs = training.want_pairs

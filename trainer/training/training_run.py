@@ -22,7 +22,7 @@ import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
-from onedemo.render.renderer import Drawing
+from onedemo.render.render_thread import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
 from onedemo.reward.warm_start import keep_start
@@ -100,7 +100,9 @@ class TrainingRun:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
         self.files = RunDirectory(data_dir, run)
-        self.dt = robot_named(config.env).dt
+        self.robot = robot_named(config.env)
+        """What learns."""
+        self.dt = self.robot.dt
         """Seconds of a control step."""
         self.queue = RatingQueue(store, run, config, simulated)
         """The clips that are put to annotators."""
@@ -123,7 +125,7 @@ class TrainingRun:
         self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
         self._drawn: _Drawn | None = None
         if renderer is not None:
-            pictures = PictureFiles(renderer, demo, self.dt)
+            pictures = PictureFiles(renderer, demo, self.robot)
             self.queue.clips = ClipMaker(store, file=self.files.clip, pictures=pictures)
             self._drawn = _Drawn(
                 pictures,

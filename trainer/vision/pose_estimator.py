@@ -24,7 +24,7 @@ from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.core.names import check_name
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.robots.registry import robot_named
 from onedemo.sim.kinematics import HEIGHT_SCALE, body_of

@@ -16,7 +16,9 @@ from onedemo.app.dataset.columns import COMPARISONS
 from onedemo.baselines.preferences import PreferencesConfig, stored_comparisons, train_preferences
 from onedemo.errors import UserError
 from onedemo.render.clip_image import read_about
-from onedemo.render.renderer import CloseUp, RenderThread
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import CloseUp
+from onedemo.robots.registry import robot_named
 from onedemo.storage.comparisons import COMPARISON_COLUMNS, NewPair
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
@@ -181,7 +183,7 @@ def test_pairs_are_made_and_drawn_while_somebody_looks(store, tmp_path):
     demo = falling_demo(tmp_path / "demo")
     learner = Learner(small_config(), demo.frames, demo.fps)
     with RenderThread() as drawing:
-        pictures = PictureFiles(drawing, demo, learner.dt)
+        pictures = PictureFiles(drawing, demo, robot_named("hopper"))
         queue = ComparisonQueue(store, "r", RunDirectory(tmp_path, "r").pair, pictures, seed=0)
         queue.fill(learner, learner.random_rollouts())
         assert store.comparisons.waiting_pairs("r", "cut") == []  # nobody looks
