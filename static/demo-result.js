@@ -5,7 +5,7 @@
 // its facts, rejected with a sentence; place() is where the server keeps it.
 //
 // Whoever else wants to look at the result listens for "demo-result", an event that bubbles from the dialog, with
-// place, facts and options as its detail, and has the empty element data-part="more" for itself.
+// place, facts and options as its detail; its place is data-part="more".
 function demoResult(part, hooks) {
   "use strict";
   const WAIT = 350; // milliseconds after a change, in which another may follow
@@ -31,7 +31,6 @@ function demoResult(part, hooks) {
     for (const name of ["first", "last"]) part(name).removeAttribute("src");
     part("facts").replaceChildren();
     part("warnings").replaceChildren();
-    part("more").replaceChildren();
   }
 
   // ---- what is chosen

@@ -90,18 +90,18 @@ def render(
         count: How many states.
         seed: Of the random states.
     """
+    from onedemo.app.services.robot_picture import robot_picture
     from onedemo.core.files import write_atomic
-    from onedemo.render.robot_sheet import picture
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise UserError(f"--out must end in .png or .jpg, got {out}")
+        raise UserError(f"the picture must end in .png or .jpg, got {out}")
     if not 1 <= count <= 60:
         raise UserError(f"--count must be 1 to 60, got {count}")
     check_output(out, data_dir)
-    drawn = picture(_named(name, data_dir), count, seed, out.suffix.lower())
+    drawn = robot_picture(_named(name, data_dir), count, seed=seed, suffix=out.suffix.lower())
     with written():
         write_atomic(out, drawn)
-    print(f"{out}: {name} at rest, then in {count - 1} random states")
+    print(f"{out}: {name} at rest and in {count - 1} random states")
 
 
 @robot.command

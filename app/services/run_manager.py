@@ -130,12 +130,13 @@ class Study:
                 raise UserError(f"there is no method {method!r}; choose from: {', '.join(METHODS)}")
             kept = settings_for_another(self.trainer.config, method)
             chosen = {key: value for key, value in (settings or {}).items() if key in OFFERED}
-            config = load_config(None, kept | chosen | {"seed": seed, "device": self._device})
+            found = find_demo(demo, self._data_dir / "demos")
+            robot = {"env": found.robot or self.trainer.config.env}
+            config = load_config(None, kept | robot | chosen | {"seed": seed, "device": self._device})
             start = None
             if predictor_from is not None:
                 start = newest_snapshot(self._store, self._data_dir, predictor_from)
                 check_start(Snapshot.load(start), config.predictor)
-            found = find_demo(demo, self._data_dir / "demos")
             run = add_run(self._store, self._data_dir, found, config, name=name)
             self._switch(run, found, config, start=start)
             return run

@@ -107,6 +107,7 @@ def demo_of(about: dict[str, Any], video: Path) -> Demo:
         width=int(about["width"]),
         height=int(about["height"]),
         task=str(about.get("task", "")),
+        robot=str(about.get("robot", "")),
         source=str(about.get("source", "")),
         edits=in_words(about.get("options") or {}),
     )

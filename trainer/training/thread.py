@@ -157,6 +157,7 @@ class Trainer:
             env_steps=training.env_steps,
             total_steps=config.rollouts.total_steps,
             steps_per_s=training.steps_per_s,
+            unstable=training.unstable,
             snapshot=snapshot.number if snapshot is not None else 0,
             ratings=training.queue.given(),
             pretrain_ratings=config.ratings.pretrain,

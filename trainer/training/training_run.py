@@ -116,6 +116,8 @@ class TrainingRun:
         """Of the last iteration that is in the database."""
         self.steps_per_s = 0.0
         """Control steps per second in the last iteration."""
+        self.unstable = 0
+        """Episodes that ended because the robot's physics became unstable."""
         self.preparing = "The run is being opened."
         """What comes before the first ``step``: what is done of it now, one sentence."""
         self.track: Track | None = None
@@ -164,6 +166,7 @@ class TrainingRun:
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
         self.learner, self.iteration, self.env_steps = learner, learner.iteration, learner.env_steps
+        self.unstable = sum(row.get("unstable", 0) for row in self.store.runs.iterations(self.run))
         self._load_snapshot()
         if self._drawn is not None:
             self._drawn.clips.recover(self.run)
@@ -304,6 +307,7 @@ class TrainingRun:
         self.queue.withdraw_stale(learner.iteration)
         self.iteration, self.env_steps = learner.iteration, learner.env_steps
         self.steps_per_s = stats["steps_per_s"]
+        self.unstable += stats.get("unstable", 0)
         if self._watch is not None:
             self._watch(learner, snapshot)
 
