@@ -33,6 +33,8 @@ class Demo:
     """The hand-coded reward that describes the move ("backflip", "hop"), or "" where none is known."""
     source: str = ""
     """What the video was made from: a file name or a command."""
+    robot: str = ""
+    """Of a video of a simulated robot its name; "" of any other video, which any robot may learn from."""
 
     @property
     def seconds(self) -> float:

@@ -23,6 +23,11 @@ DEFAULT = "hopper"
 """The robot where none is named."""
 
 
+def names() -> list[str]:
+    """The robots there are."""
+    return sorted(BUILT_IN)
+
+
 @lru_cache(maxsize=64)
 def robot_named(name: str) -> Robot:
     """The robot of that name.

@@ -107,6 +107,15 @@ def _leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def check_robot(demo: Demo, robot: str) -> None:
+    """Raises UserError if the demo is of another robot than the one that would learn from it, by name."""
+    if demo.robot and demo.robot != robot:
+        raise UserError(
+            f"demonstration {demo.name!r} shows robot {demo.robot!r}, but this run's robot is {robot!r}: "
+            f"choose a demonstration of {robot!r}, or robot {demo.robot!r}"
+        )
+
+
 def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name: str | None) -> str:
     """Records a new run and writes its settings; returns its name.
 
@@ -118,9 +127,10 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         name: What to call it, or None: ``<demo>-<number>``.
 
     Raises:
-        UserError: If the demo is shorter than a clip, the robot is unknown, or the name is taken or
-            cannot be the name of a directory.
+        UserError: If the demo is shorter than a clip or shows another robot, the robot is unknown, or the
+            name is taken or cannot be the name of a directory.
     """
+    check_robot(demo, robot_named(config.env).name)
     lengths(config, demo.frames, demo.fps)
     if name is not None:
         check_new_name(check_name(name))
