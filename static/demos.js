@@ -245,7 +245,9 @@ const demos = (() => {
   function offer(name) {
     const choice = document.querySelector(".od-new-run select[name=demo]");
     if (choice && ![...choice.options].some((option) => option.value === name)) choice.add(new Option(name));
-    if (choice) choice.value = name;
+    if (!choice) return;
+    choice.value = name;
+    choice.dispatchEvent(new Event("change", { bubbles: true })); // its robot is chosen with it
   }
 
   function startRun(name) {

@@ -1,5 +1,5 @@
 // Draws a side of a clip: a frame out of its picture, and what is known of it (trainer/render/framing.py):
-// heights, the way along the floor, the first pose, the paths of head and foot. Metres, where not pixels.
+// heights, the way along the floor, the first pose, the paths of its ends. Metres, where not pixels.
 const drawing = (() => {
   "use strict";
   const INK = "24 32 43";

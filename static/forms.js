@@ -208,6 +208,17 @@
     ).finally(() => (button.disabled = false));
   });
 
+  // A demo that shows a robot is learned by that robot alone: the one is chosen with the other.
+  document.addEventListener("change", (event) => {
+    const form = event.target.closest?.(".od-new-run form");
+    if (!form || !["demo", "env"].includes(event.target.name)) return;
+    const [robot, demos] = [form.elements.env, form.elements.demo];
+    const shown = demos.selectedOptions[0]?.dataset.of;
+    if (event.target === demos && shown && [...robot.options].some((o) => o.value === shown)) robot.value = shown;
+    for (const option of demos.options) option.disabled = Boolean(option.dataset.of) && option.dataset.of !== robot.value;
+    if (demos.selectedOptions[0]?.disabled) demos.value = [...demos.options].find((o) => !o.disabled)?.value ?? "";
+  });
+
   // The sentence at a field; none if it is empty.
   function wrong(input, text) {
     const field = input.closest(".od-field");

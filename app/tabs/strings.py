@@ -8,7 +8,7 @@ Keys = tuple[tuple[tuple[str, ...], str], ...]
 _PLAYING: Keys = (
     (("Space",), "play it again from the start"),
     (("F",), "slow motion, on and off"),
-    (("T",), "first pose and paths of head and foot, on and off"),
+    (("T",), "first pose and paths through the clip, on and off"),
     (("←", "→"), "one frame back or forward"),
 )
 _HELP: Keys = ((("?",), "show these keys"),)

@@ -176,7 +176,8 @@ def test_a_video_is_trimmed_cropped_looked_at_kept_and_learned_from(chromium, si
             None,
         )
         assert wanted["settings"] == {
-            "ratings.pretrain": 12, "ratings.online": 150, "rollouts.total_steps": 10_000_000,
+            "env": "hopper", "ratings.pretrain": 12, "ratings.online": 150,
+            "rollouts.total_steps": 10_000_000,
             "ratings.clip_seconds": 0.5, "ratings.choice": "high",
         }  # fmt: skip
         # The library: renamed, and removed after a question.

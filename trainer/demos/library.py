@@ -20,7 +20,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.demos.video import VideoReader, jpeg, write_webm
 from onedemo.errors import UserError
 from onedemo.types import Demo
+
+if TYPE_CHECKING:
+    from onedemo.robots.robot import Robot
 
 BUILT_IN = Path(static.__file__).parent / "demos"
 
@@ -196,7 +199,7 @@ def render_demo(
     task: str,
     source: str,
     out_dir: Path = BUILT_IN,
-    dt: float = 0.008,
+    robot: Robot | None = None,
     fps: float = 30.0,
 ) -> Demo:
     """Films stored positions: ``<out_dir>/<name>.webm`` and ``<name>.json``, 480 x 360.
@@ -207,7 +210,7 @@ def render_demo(
         task: The hand-coded reward that describes the move.
         source: The command or study that made the motion.
         out_dir: Where to write; overwrites files of the same name.
-        dt: Seconds per control step.
+        robot: Whose positions; the hopper's if None.
         fps: Frames per second.
 
     Returns:
@@ -217,11 +220,14 @@ def render_demo(
         UserError: If the name is not allowed or this machine cannot draw.
     """
     from onedemo.render.renderer import Renderer
+    from onedemo.robots.registry import DEFAULT, robot_named
 
     check_name(name)
+    robot = robot or robot_named(DEFAULT)
+    dt = robot.dt
     count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)
     steps = np.minimum(steps_of_frames(count, dt, fps), len(qpos_Tq) - 1)
-    with Renderer() as renderer:
+    with Renderer(robot=robot) as renderer:
         frames = renderer.render(np.asarray(qpos_Tq)[steps])
     out_dir.mkdir(parents=True, exist_ok=True)
     temporary = out_dir / f".{name}.partial.webm"
@@ -236,6 +242,7 @@ def render_demo(
             frames=count,
             task=task,
             source=source,
+            robot=robot.name,
         )
         os.replace(temporary, out_dir / f"{name}.webm")
     finally:
