@@ -50,13 +50,9 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def looked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data directory that knows robot and demo already, to be copied: made once for all processes.
-
-    The robot is learned from fewer pictures than it is for people: poor, but a minute less.
-    """
+    """A data directory that knows the demo already, to be copied: made once for all processes."""
     from onedemo.core.files import hold
     from onedemo.demos.library import find_demo
-    from onedemo.vision import pose_estimator
     from onedemo.vision.encoders import demo_features, make_encoder
 
     base = tmp_path_factory.getbasetemp()
@@ -64,7 +60,6 @@ def looked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = shared / "looked"
     with hold(shared / "looked.lock", wait=True):
         encoder = make_encoder("efficientnet-lite0")
-        pose_estimator.learn("hopper", encoder, directory / "robots", count=300)
         demo_features(find_demo("hopper-backflip", directory / "demos"), encoder, directory / "demos")
     return directory
 

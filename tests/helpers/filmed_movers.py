@@ -29,8 +29,11 @@ def positions(name: str, count: int = 240) -> np.ndarray:
 
 
 class Film:
-    """Pictures (F, H, W, 3), and the truth: what the mover is (F, H, W), where the camera was (F,), metres, and
-    the row of the floor (F,), or None."""
+    """Pictures (F, H, W, 3), and the truth.
+
+    That is: what the mover is (F, H, W), where the camera was (F,), metres, and the row of the floor (F,), or
+    None.
+    """
 
     def __init__(
         self,

@@ -16,8 +16,9 @@ from onedemo.core.names import check_name
 from onedemo.core.outputs import check_outputs
 from onedemo.demos.ground_truth import SUFFIX, load_hidden
 from onedemo.demos.library import BUILT_IN, render_demo, show
-from onedemo.vision.encoders import demo_features, make_encoder
-from onedemo.vision.pose_estimator import keep_track, learn
+from onedemo.vision.mask_file import masks_of
+from onedemo.vision.pose_estimator import keep_track
+from onedemo.vision.silhouette import learn
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -36,6 +37,7 @@ def main(arguments: list[str] | None = None) -> None:
     demo = render_demo(qpos, name=asked.name, task=asked.task, source=asked.source, out_dir=asked.out)
     print(show(demo))
     if asked.cache is not None:
-        encoder = make_encoder(load_config().encoder)
-        look = learn(load_config().env, encoder, asked.cache / "robots")
-        keep_track(demo, look.track(demo_features(demo, encoder, asked.cache / "demos"), demo.fps))
+        learned = learn(load_config().env, asked.cache / "robots")
+        track = learned.track(masks_of(demo, learned.reach), demo.fps)
+        assert track is not None, "it shows the robot"
+        keep_track(demo, track)

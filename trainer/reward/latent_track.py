@@ -30,7 +30,7 @@ _TIME_SHARE = 0.5
 _BASIS = 40
 _SMOOTH = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 _AROUND = 2
-"""Frames before and after over which a motion is taken, as in ``trainer/vision/pose_estimator.py``."""
+"""Frames before and after over which a motion is taken."""
 _HEIGHT = 1.0
 """Pose units (``body.HEIGHT_SCALE``) about which heights vary."""
 _SOFT = 0.05

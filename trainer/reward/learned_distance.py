@@ -9,7 +9,7 @@ ratings say how much each part of the difference matters, and at which distances
 the ordered logit of McCullagh 1980 (proportional odds) on a distance. Where the rater has marked a part
 of a clip as wrong, that part is taken to be further off than the rest, with the probability
 sigmoid(g (mean of d inside - mean outside)). Where the track is seen
-(``trainer/vision/pose_estimator.py``) that is 23 numbers, so a few dozen ratings fit it; a network of
+(``trainer/vision/silhouette.py``) that is 23 numbers, so a few dozen ratings fit it; a network of
 thousands has
 to learn first that near is like. Where it is not, the track itself is fitted to the ratings, too
 (``trainer/reward/latent_track.py``).

@@ -19,9 +19,11 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from onedemo.types import Demo
 from onedemo.vision import learned_robots
+from onedemo.vision.mask_file import masks_of
 from onedemo.vision.masks import Masks
-from onedemo.vision.pose_estimator import Track
+from onedemo.vision.pose_estimator import Track, shipped_track
 from onedemo.vision.silhouette_pictures import TRAVEL_SCALE, Films, films
 from onedemo.vision.silhouette_views import FOUND, PLACES, RATE, SIDE, Views, views
 
@@ -41,7 +43,7 @@ _DRAWING = 0.25
 """Share of the time that drawing takes, as measured."""
 _WIDTH = 96
 _HELD_OUT = 0.1
-_ANOTHER = 0.6
+_ANOTHER = 0.5
 """Doubt of half of the frames of a video from which on it shows another body."""
 _COARSE = 4
 """Pixels along a side of the parts whose covered share is compared with that of the pose that was read."""
@@ -145,6 +147,29 @@ class Silhouette:
     @property
     def _pose(self) -> int:
         return (len(self.held_out) - 2) // 2
+
+
+def seen_in(
+    demo: Demo, env_name: str, cache_dir: Path, check: Callable[[float], None] = lambda _: None
+) -> Track | None:
+    """What a demo shows of a robot: of a built-in one as it was kept beside its video, else read now.
+
+    Args:
+        demo: The demo.
+        env_name: The robot.
+        cache_dir: As of ``learn``.
+        check: The same.
+
+    Returns:
+        None if it shows another body.
+
+    Raises:
+        UserError: If the stored video is missing or damaged, or this machine cannot draw.
+    """
+    if (track := shipped_track(demo)) is not None:
+        return track
+    learned = learn(env_name, cache_dir, check)
+    return learned.track(masks_of(demo, learned.reach), demo.fps)
 
 
 def file_name(env_name: str) -> str:

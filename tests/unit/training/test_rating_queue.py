@@ -114,10 +114,12 @@ def test_looking_tells_how_far_it_is_and_only_where_it_takes_time(store, tmp_pat
     told = []
 
     class Look:
-        def knows(self, features):
-            return False
+        reach = 1.6
 
-    def learn(env, encoder, cache, check):
+        def track(self, masks, fps):
+            return None
+
+    def learn(env, cache, check):
         for share in (0.0, 0.25, 0.5):
             time.sleep(0.02)
             check(share)
@@ -137,4 +139,4 @@ def test_looking_tells_how_far_it_is_and_only_where_it_takes_time(store, tmp_pat
 
     training._learn_robot = lambda *_: Look()  # learned before: nothing is said of pictures
     training.look()
-    assert "video" in training.preparing
+    assert "looked for in the demonstration video" in training.preparing

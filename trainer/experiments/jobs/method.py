@@ -40,7 +40,7 @@ from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo
 from onedemo.vision.encoders import demo_features, make_encoder
-from onedemo.vision.pose_estimator import learn as learn_pose_estimator
+from onedemo.vision.silhouette import seen_in
 
 POINTS = 12
 """Of a learning curve."""
@@ -162,7 +162,7 @@ def prepare(demo: Demo, config: RunConfig, cache: Path) -> Any:
         demo_features(demo, encoder, cache / "demos")
     if config.predictor.appearance:
         with hold(cache / "robots" / "lock", wait=True):
-            learn_pose_estimator(config.env, encoder, cache / "robots")
+            seen_in(demo, config.env, cache / "robots")
     return encoder
 
 
