@@ -58,6 +58,10 @@ class Track:
     """(F, P), float32, as ``body.pose``."""
     motion: np.ndarray
     """(F, P), float32, as ``body.motion``."""
+    travel: np.ndarray | None = None
+    """Velocity of the root to the right, m/s, (F,), float32, as ``body.travel``; None: not known."""
+    contact: np.ndarray | None = None
+    """How far it touches the ground, 0..1, (F,), float32, as ``body.contact``; None: not known."""
     doubt: np.ndarray | None = None
     """How unsure the pose is, (F,), float32: 0 is sure, 1 may be any; None: not said."""
 
@@ -120,15 +124,19 @@ def shipped_track(demo: Demo) -> Track | None:
     if (data := read_whole(_track_file(demo))) is None:
         return None
     with np.load(io.BytesIO(data), allow_pickle=False) as stored:
-        return Track(pose=stored["pose"], motion=stored["motion"], doubt=stored["doubt"])
+        return Track(**{name: stored[name] for name in _KEPT if name in stored.files})
 
 
 def keep_track(demo: Demo, track: Track) -> None:
     """Keeps what a demo shows of the robot beside its video."""
     assert track.doubt is not None, "the pose estimator says how sure it is"
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, pose=track.pose, motion=track.motion, doubt=track.doubt)
+    known = {name: x for name in _KEPT if (x := getattr(track, name)) is not None}
+    np.savez_compressed(buffer, allow_pickle=False, **known)
     write_atomic(_track_file(demo), buffer.getvalue())
+
+
+_KEPT = ("pose", "motion", "travel", "contact", "doubt")
 
 
 def _track_file(demo: Demo) -> Path:
