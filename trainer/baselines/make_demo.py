@@ -15,9 +15,9 @@ from onedemo.config import load_config
 from onedemo.core.names import check_name
 from onedemo.core.outputs import check_outputs
 from onedemo.demos.ground_truth import SUFFIX, load_hidden
-from onedemo.demos.library import BUILT_IN, render_demo, show
+from onedemo.demos.library import BUILT_IN, read_frames, render_demo, show
 from onedemo.vision.encoders import demo_features, make_encoder
-from onedemo.vision.pose_estimator import keep_track, learn
+from onedemo.vision.pose_estimator import keep_track, learn, with_ground
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -38,4 +38,5 @@ def main(arguments: list[str] | None = None) -> None:
     if asked.cache is not None:
         encoder = make_encoder(load_config().encoder)
         look = learn(load_config().env, encoder, asked.cache / "robots")
-        keep_track(demo, look.track(demo_features(demo, encoder, asked.cache / "demos"), demo.fps))
+        track = look.track(demo_features(demo, encoder, asked.cache / "demos"), demo.fps)
+        keep_track(demo, with_ground(track, read_frames(demo), demo.fps))

@@ -22,6 +22,7 @@ import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
+from onedemo.demos.library import read_frames
 from onedemo.render.renderer import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
@@ -42,7 +43,7 @@ from onedemo.training.pictures import PictureFiles, tidy
 from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Clip, Demo, Rollouts
 from onedemo.vision.encoders import Encoder, demo_features
-from onedemo.vision.pose_estimator import PoseEstimator, Track
+from onedemo.vision.pose_estimator import PoseEstimator, Track, with_ground
 from onedemo.vision.pose_estimator import learn as learn_pose_estimator
 
 _TIDY_S = 10.0
@@ -191,7 +192,10 @@ class TrainingRun:
             look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", note)
         finally:
             self._learning = None
-        return features, look.track(features, self.demo.fps) if look.knows(features) else None
+        if not look.knows(features):
+            return features, None
+        track = look.track(features, self.demo.fps)
+        return features, with_ground(track, read_frames(self.demo), self.demo.fps)
 
     def looking(self) -> tuple[float | None, float | None]:
         """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.

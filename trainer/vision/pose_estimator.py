@@ -14,7 +14,7 @@ import hashlib
 import io
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from torch.nn import functional
 
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.core.names import check_name
+from onedemo.render.mover import contact_of, is_studio, locate, travel_of
 from onedemo.render.renderer import RenderThread
 from onedemo.rl.random_states import wild_rollouts
 from onedemo.robots.registry import robot_named
@@ -114,6 +115,24 @@ class PoseEstimator:
             pose=body.pose_of(height, angles).astype(np.float32), motion=motion.astype(np.float32),
             doubt=np.linalg.norm(short, axis=-1).astype(np.float32),
         )  # fmt: skip
+
+
+def with_ground(track: Track, frames: np.ndarray, fps: float) -> Track:
+    """The same, with travel and contact where pictures tell them: those of the robot's own studio.
+
+    Args:
+        track: What F frames show.
+        frames: (F, H, W, 3), uint8 RGB.
+        fps: Frames per second.
+    """
+    mover = locate(frames) if is_studio(frames) else None
+    if mover is None:
+        return track
+    travel, contact = travel_of(mover, fps), contact_of(mover)
+    return replace(
+        track, travel=None if travel is None else travel.astype(np.float32),
+        contact=None if contact is None else contact.astype(np.float32),
+    )  # fmt: skip
 
 
 def shipped_track(demo: Demo) -> Track | None:

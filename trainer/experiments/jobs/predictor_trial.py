@@ -20,7 +20,7 @@ import torch
 from onedemo.annotators.oracle import Oracle
 from onedemo.config import load_config
 from onedemo.demos.ground_truth import hidden_path, load_hidden
-from onedemo.demos.library import find_demo
+from onedemo.demos.library import find_demo, read_frames
 from onedemo.experiments.jobs.method import prepare
 from onedemo.experiments.jobs.predictor_exam import Exam
 from onedemo.experiments.predictor_scores import calibration_error, confusion, f1, macro_f1, reliability
@@ -191,4 +191,5 @@ def _look(demo: Demo, kept: Path) -> _Scene:
     encoder = prepare(demo, load_config(), kept)  # one job at a time
     features = demo_features(demo, encoder, kept / "demos")
     look = pose_estimator.learn(load_config().env, encoder, kept / "robots")
-    return _Scene(features=features, track=look.track(features, demo.fps))
+    track = pose_estimator.with_ground(look.track(features, demo.fps), read_frames(demo), demo.fps)
+    return _Scene(features=features, track=track)
