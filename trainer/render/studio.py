@@ -7,6 +7,8 @@ differ in lightness as well as in hue, for those who see no red or no green.
 
 from __future__ import annotations
 
+import warnings
+
 import mujoco
 import numpy as np
 
@@ -97,7 +99,9 @@ def studio_model(robot: Robot, *, width: int, height: int) -> mujoco.MjModel:
     spec.worldbody.add_camera(name=EYE, fovy=FOVY)
     for geom in spec.geoms:
         geom.material = ""
-    model = spec.compile()
+    with warnings.catch_warnings():  # of attributes that are old, but mean what they meant
+        warnings.simplefilter("ignore")
+        model = spec.compile()
     seen = visible_geoms(model)
     model.geom_rgba[:, :3] = colours_of(robot, model)
     model.geom_rgba[:, 3] = 0
