@@ -48,6 +48,15 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         asyncio._set_running_loop(loop)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def warm_servers() -> None:
+    """Servers are forks of a process that has imported what they need."""
+    from helpers import warm
+    from load import serving
+
+    serving.begin = warm.begin
+
+
 @pytest.fixture(scope="session")
 def looked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data directory that knows robot and demo already, to be copied: made once for all processes.
