@@ -132,7 +132,13 @@ _ports: list[int] = []
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
+def live_fps() -> float:
+    """Frames a second of the live robot: without a GPU each keeps a core busy for a quarter of a second."""
+    return 0.5
+
+
+@pytest.fixture
+def site(tmp_path: Path, live_fps: float) -> Iterator[Site]:
     """A front with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
@@ -149,7 +155,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames, track=lambda: trainer.track),
         again=Again(shared=0, repeated=0),
         guard_seconds=0.05,
-        live_fps=2.0,  # without a GPU each frame costs a tenth of a second
+        live_fps=live_fps,
     )
     try:
         front = Front(page, Listening(port=_ports.pop() if _ports else 0))
