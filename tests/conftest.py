@@ -20,7 +20,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by 
 
 
 LONGEST = (
-    "test_rating_flow test_page test_end_to_end test_charts test_layout test_researcher test_served_product"
+    "test_end_to_end test_rating_flow test_page test_charts test_layout test_researcher test_served_product"
     " test_line test_faults test_trainer test_clip_player test_jobs test_accessible test_cli test_renderer"
     " test_learner test_backup_doctor test_addresses_and_demos test_resume test_start test_speed test_kills"
     " test_installed test_foreign_code test_custom test_security test_speed_pictures test_sandboxed_decoder"
