@@ -1,5 +1,5 @@
 // Draws a side of a clip: a frame out of its picture, and what is known of it (trainer/render/framing.py):
-// heights, the way along the floor, the first pose, the paths of head and foot. Metres, where not pixels.
+// heights, the way along the floor, the first pose, the paths of its ends. Metres, where not pixels.
 const drawing = (() => {
   "use strict";
   const INK = "24 32 43";
@@ -28,16 +28,19 @@ const drawing = (() => {
       return;
     }
     const metre = width / side.width;
-    const at = ([x, z]) => [(x - side.left[frame]) * metre, height - (z - side.bottom) * metre];
+    const bottom = side.bottom[frame] ?? side.bottom; // seen from above it goes along, too
+    const at = ([x, z]) => [(x - side.left[frame]) * metre, height - (z - bottom) * metre];
     if (side.camera) drawScale(place, side, frame, metre, at);
     if (trail) drawTrail(place, side, frame, at);
-    if (labels && side.head) {
+    if (labels) {
       pen.globalAlpha = labels;
-      drawWord(place, "Head", at(side.head[frame]), HEAD);
-      drawWord(place, "Foot", at(side.foot[frame]), FOOT);
+      marksOf(side).forEach(([word, path, colour]) => word && drawWord(place, word, at(path[frame]), colour));
       pen.globalAlpha = 1;
     }
   }
+
+  // Each path with its word, if it is named, and its colour.
+  const marksOf = (side) => (side.marks ?? []).map(([word, path], k) => [word, path, k ? FOOT : HEAD]);
 
   // Lines every half metre above the floor, and marks on the floor, which stay where they are in the world.
   function drawScale({ pen, width, height, unit }, side, frame, metre, at) {
@@ -46,7 +49,11 @@ const drawing = (() => {
     pen.font = `${11 * unit}px system-ui, sans-serif`;
     pen.lineWidth = unit;
     pen.textAlign = "right";
-    for (let z = 0.5; z < side.bottom + height / metre; z += 0.5) {
+    // Of a small robot these are decimetres, or whatever the floor's squares are.
+    const { unit: step } = side;
+    const said = (metres) => `${Number(metres.toPrecision(3))} m`;
+    for (let k = 1; k / 2 < (side.bottom + height / metre) / step; k += 1) {
+      const z = (k / 2) * step;
       const y = Math.round(at([0, z])[1]) + unit / 2;
       if (y > height) continue;
       pen.strokeStyle = `rgb(${INK} / 13%)`;
@@ -55,26 +62,26 @@ const drawing = (() => {
       pen.lineTo(width, y);
       pen.stroke();
       pen.fillStyle = `rgb(${INK} / 55%)`;
-      if (y > 46 * unit) pen.fillText(`${z} m`, width - 8 * unit, y - 4 * unit);
+      if (y > 46 * unit) pen.fillText(said(z), width - 8 * unit, y - 4 * unit);
     }
     // On the near side of the robot's lane, where it hides none.
-    const near = (distance / (distance - 0.3)) * metre;
+    const near = (distance / (distance - 0.3 * step)) * metre;
     const eye = side.eye[frame];
     const middle = at([eye, 0])[0];
     const y = at([0, cameraHeight])[1] + cameraHeight * near;
     if (y > height - 2 * unit) return;
     pen.strokeStyle = pen.fillStyle = `rgb(${INK} / 55%)`;
     pen.textAlign = "center";
-    const first = Math.ceil((eye - side.eye[0] - middle / near) * 4);
-    const last = Math.floor((eye - side.eye[0] + (width - middle) / near) * 4);
+    const first = Math.ceil(((eye - side.eye[0] - middle / near) * 4) / step);
+    const last = Math.floor(((eye - side.eye[0] + (width - middle) / near) * 4) / step);
     for (let k = first; k <= last; k += 1) {
-      const x = Math.round(middle + (side.eye[0] + k / 4 - eye) * near);
+      const x = Math.round(middle + (side.eye[0] + (k / 4) * step - eye) * near);
       const long = k % 2 === 0;
       pen.beginPath();
       pen.moveTo(x, y);
       pen.lineTo(x, y + (long ? 7 : 4) * unit);
       pen.stroke();
-      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${Math.abs(k / 4)} m` : "0", x, y + 17 * unit);
+      if (long) pen.fillText(k ? `${k > 0 ? "+" : "−"}${said(Math.abs(k / 4) * step)}` : "0", x, y + 17 * unit);
     }
   }
 
@@ -92,8 +99,7 @@ const drawing = (() => {
       pen.stroke();
       pen.setLineDash([]);
     }
-    for (const [path, colour] of [[side.head, HEAD], [side.foot, FOOT]]) {
-      if (!path) continue;
+    for (const [, path, colour] of marksOf(side)) {
       for (const [line, stroke] of [[5, "rgb(255 255 255 / 75%)"], [2.5, `rgb(${colour})`]]) {
         pen.beginPath();
         for (const point of path) pen.lineTo(...at(point));
@@ -133,6 +139,7 @@ const drawing = (() => {
 
   // At the top right, where there is neither a caption nor the floor.
   function drawPace({ pen, width, unit }, pace) {
+    if (width < 165 * unit) return; // the caption has all the room
     const word = { 1: "1×", 0.5: "½×", 0.25: "¼×" }[pace];
     pen.font = `600 ${12 * unit}px system-ui, sans-serif`;
     pen.fillStyle = "rgb(255 255 255 / 72%)";

@@ -30,12 +30,14 @@ const moves = (() => {
   const part = (name) => root.querySelector(`[data-moves-part="${name}"]`);
   const video = () => root.querySelector("video");
 
-  function begin(dialog, name, about) {
+  function begin(dialog, name, about, source) {
     if (!root) {
       root = dialog.querySelector("[data-moves]");
       listen();
     }
     [upload, facts, found, marks, stale, cross, corner] = [name, about, null, [], false, null, null];
+    video().src = source;
+    video().play().catch(() => {});
     part("at").max = about.frames - 1;
     [part("drawn").width, part("drawn").height] = [about.width, about.height];
     choose("");

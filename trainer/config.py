@@ -87,7 +87,10 @@ class RunConfig:
     seed: int = 0
     """Of every random number in the run."""
     env: str = "hopper"
-    """The robot: a name in the registry of ``trainer/sim/vector_env.py``."""
+    """The robot: one that comes with the program, one of your own (``onedemo robot add``), or gym:ID. Where
+    nothing is said, the one that the demo was made with, or the hopper."""
+    env_sha256: str = ""
+    """Of the robot's model: noted when a run is made, which goes on with no other."""
     device: str = "cpu"
     """Where predictor and policy compute: "cpu", "cuda" or "cuda:N"."""
     encoder: str = "efficientnet-lite0"
@@ -114,19 +117,22 @@ def split_ratings(total: int) -> tuple[int, int]:
     return pretrain, total - pretrain
 
 
-def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> RunConfig:
+def load_config(
+    path: Path | None = None, overrides: dict[str, Any] | None = None, defaults: dict[str, Any] | None = None
+) -> RunConfig:
     """The defaults, changed by a TOML file, changed by overrides.
 
     Args:
         path: TOML file, or None.
         overrides: ``{"trpo.max_kl": 0.02}``: dotted key to value, as TOML would give it.
+        defaults: Of the same kind: what holds where nothing else is said.
 
     Raises:
         UserError: If the file cannot be read, a key does not exist or a value does not fit.
     """
     in_file = _by_key(_read(path)) if path is not None else {}
     given = in_file | (overrides := _by_key(overrides or {}))
-    known = _by_key(asdict(RunConfig()))
+    known = _by_key(asdict(RunConfig())) | (defaults or {})
 
     def wrong(key: str, said: str) -> UserError:
         return UserError(f"{path}: {said}" if key in in_file.keys() - overrides.keys() else said)

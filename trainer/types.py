@@ -31,8 +31,12 @@ class Demo:
     """Pixels."""
     task: str = ""
     """The hand-coded reward that describes the move ("backflip", "hop"), or "" where none is known."""
+    robot: str = ""
+    """The robot that it was made with, and for; "" for a video of anything else, which is for any robot."""
     source: str = ""
     """What the video was made from: a file name or a command."""
+    edits: str = ""
+    """What was done to that video on its way in, in a few words."""
 
     @property
     def seconds(self) -> float:
@@ -175,6 +179,8 @@ class Status:
     """Control steps at which the run is done."""
     steps_per_s: float = 0.0
     """Control steps per second in the last iteration."""
+    unstable: int = 0
+    """Episodes that ended because the robot's physics became unstable, so far."""
     snapshot: int = 0
     """Newest snapshot of the similarity predictor; 0 if there is none."""
     ratings: int = 0
@@ -185,3 +191,8 @@ class Status:
     """Ratings asked for in all."""
     next_clips_s: float | None = None
     """Seconds until the iteration ends, and with it new clips are expected; None if not known."""
+
+    @property
+    def asked_ratings(self) -> int:
+        """Ratings that people are asked for so far, as ``RatingQueue.asked``."""
+        return self.target_ratings if self.iteration else self.pretrain_ratings

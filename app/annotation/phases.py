@@ -38,7 +38,7 @@ def told(status: Status) -> str:
             missing = max(0, status.pretrain_ratings - status.ratings)
             return f"The robot moves at random. It starts practising after {_ratings(missing, 'more')}."
         case "online":
-            return "The robot practises with what was learned from the ratings."
+            return f"The robot practises with what was learned from the ratings.{_unstable(status)}"
         case "pausing":
             return f"{_iteration_ends(status)} Then practice rests; clips can still be rated."
         case "paused":
@@ -48,11 +48,18 @@ def told(status: Status) -> str:
         case "stopped":
             return "Nothing goes on until the run is resumed, from where it was."
         case "done":
-            return "The robot has practised as long as it was told to."
+            return f"The robot has practised as long as it was told to.{_unstable(status)}"
         case _ if not status.saved:
             return "Nothing is saved any more. Stop onedemo, and do what its log says."
         case _:
             return "It is tried again automatically. Ratings are kept, and clips can still be rated."
+
+
+def _unstable(status: Status) -> str:
+    if not status.unstable:
+        return ""
+    episodes = f"{status.unstable:,} episode{'' if status.unstable == 1 else 's'}"
+    return f" {episodes} ended early as the physics became unstable: its model needs a smaller timestep."
 
 
 def waiting(status: Status, *, used: int, researcher: bool, taken: bool = False) -> Waiting:

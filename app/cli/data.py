@@ -103,7 +103,9 @@ def import_(
         history: HISTORY.csv of the export.
     """
     from onedemo.app.dataset.importer import Export, export_in, import_data
+    from onedemo.robots import registry
 
+    registry.use(data_dir)
     if source.is_dir():
         given = export_in(source)
     elif segments is None:

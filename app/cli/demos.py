@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,9 @@ demo = App(name="demo", help="Bring in and look at demonstration videos.")
 @demo.command
 def add(
     video: Path, /, *others: Path, name: str, start: float | None = None, end: float | None = None,
-    crop: str | None = None, mirror: bool = False, fps: float = 30.0, data_dir: DataDir = DATA,
+    rotate: str = "0", stabilise: bool = False, crop: str | None = None, track: bool = False,
+    mirror: bool = False, speed: str = "1", reverse: bool = False, loop: str | bool = False,
+    fps: float = 30.0, data_dir: DataDir = DATA,
 ) -> None:  # fmt: skip
     """Bring in a video.
 
@@ -32,11 +35,17 @@ def add(
         name: What to call it.
         start: Begin at this second.
         end: End at this second.
-        crop: Keep this rectangle: X,Y,W,H in pixels.
+        rotate: Turn it clockwise: 90, 180 or 270 degrees.
+        stabilise: Hold the background still.
+        crop: Keep this rectangle: X,Y,W,H in pixels, once it is turned.
+        track: Let the rectangle follow what moves in it at first; without --crop, all that moves.
         mirror: Swap left and right.
+        speed: Play it so many times faster, 0.1 to 20: the video shows the move slowed.
+        reverse: Play it backwards.
+        loop: Repeat it so many times, end to end; without a number as often as fits into 8 s.
         fps: Frames per second to keep.
     """
-    from onedemo.demos.import_checks import read_crop
+    from onedemo.demos.edits import read_crop, read_loop, read_rotation, read_speed
     from onedemo.demos.library import import_video
 
     if others:
@@ -51,11 +60,15 @@ def add(
     demos_dir = data_dir / "demos"
     check_data_dir(demos_dir)
     added = import_video(
-        video, name=name, demos_dir=demos_dir, start=start, end=end, crop=rectangle, mirror=mirror, fps=fps
-    )
+        video, name=name, demos_dir=demos_dir, start=start, end=end, crop=rectangle, mirror=mirror, fps=fps,
+        speed=read_speed(speed), reverse=reverse, loop=read_loop(loop), rotate=read_rotation(rotate),
+        track=track, stabilise=stabilise, warn=lambda said: print(f"onedemo: {said}", file=sys.stderr),
+    )  # fmt: skip
     if added.name != name:
         print(f"this video with these options is known already, as {added.name}")
     print(f"{added.name}: {added.seconds:.1f} s, {added.frames} frames, {added.width}x{added.height}")
+    if added.edits:
+        print(f"done to the video: {added.edits}")
     print(f"learn it with: onedemo serve --demo {added.name} --data-dir {data_dir}")
 
 
@@ -65,7 +78,8 @@ def list_(*, data_dir: DataDir = DATA) -> None:
     from onedemo.demos.library import list_demos
 
     for each in list_demos(data_dir / "demos"):
-        print(f"{each.name:24} {each.seconds:5.1f} s  {each.width}x{each.height}  {each.source}")
+        done = f" ({each.edits})" if each.edits else ""
+        print(f"{each.name:24} {each.seconds:5.1f} s  {each.width}x{each.height}  {each.source}{done}")
 
 
 @demo.command

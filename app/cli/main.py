@@ -42,6 +42,7 @@ _COMMANDS = {
     "run:serve": "The web app with its trainer thread.",
     "run:train": "The same trainer without a browser, rated by a program.",
     "demos:demo": "Bring in and look at demonstration videos.",
+    "robot:robot": "Bring in and look at robots: any MuJoCo model.",
     "people:rater": "People and their links.",
     "proxy:proxy": "Lines for nginx or Caddy before the server.",
     "people:rating": "Single ratings: withdraw one.",

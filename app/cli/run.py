@@ -6,13 +6,16 @@ import json
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from onedemo.app.cli.data import DATA, DataDir, Whole, check_output
-from onedemo.config import describe, load_config, parse_override, split_ratings
+from onedemo.config import RunConfig, describe, load_config, parse_override, split_ratings
 from onedemo.errors import UserError
+
+if TYPE_CHECKING:
+    from onedemo.types import Demo
 
 
 @Parameter(name="*")
@@ -23,6 +26,8 @@ class RunOptions:
     data_dir: DataDir = DATA
     demo: str = "hopper-backflip"
     """What to learn."""
+    robot: str | None = None
+    """Who learns it: see `onedemo robot list`, or gym:ID [default: whom the demo was made with]."""
     run: str | None = None
     """Resume this run, or name a new one."""
     method: Literal["onedemo", "paper"] | None = None
@@ -43,8 +48,21 @@ class RunOptions:
     def overrides(self) -> dict[str, Any]:
         """The settings that were typed; an option beats ``--set``."""
         typed = {key: getattr(self, key) for key in ("method", "seed", "device", "encoder")}
+        typed["env"] = self.robot
         given = {key: value for key, value in typed.items() if value is not None}
         return dict(parse_override(text) for text in self.set or ()) | given
+
+    def found(self, overrides: dict[str, Any]) -> tuple[Demo, RunConfig]:
+        """The demo, and the settings of a run of it.
+
+        Raises:
+            UserError: If there is no such demo or setting.
+        """
+        from onedemo.demos.library import find_demo
+
+        load_config(self.config, overrides)  # what is wrong with the settings comes first
+        demo = find_demo(self.demo, self.data_dir / "demos")
+        return demo, load_config(self.config, overrides, {"env": demo.robot} if demo.robot else {})
 
 
 NONE = RunOptions()
@@ -85,7 +103,6 @@ def serve(
         raise UserError(f"argument --port: must be a whole number from 0 to 65535, got '{port}'")
     from onedemo.app.annotation.assignment import Again
     from onedemo.app.network.bind import Listening, check_port
-    from onedemo.demos.library import find_demo
 
     listening = Listening(
         host=host.removeprefix("[").removesuffix("]"), port=port, tls_cert=tls_cert, tls_key=tls_key,
@@ -93,12 +110,11 @@ def serve(
         base_path=base_path.rstrip("/"),
     )  # fmt: skip
     overrides = options.overrides()
-    config = load_config(options.config, overrides)
+    demo, config = options.found(overrides)
     try:
         again = Again(shared=shared, repeated=repeated)
     except ValueError as error:
         raise UserError(str(error)) from None
-    demo = find_demo(options.demo, options.data_dir / "demos")
     listening.ssl_context()
     check_port(listening.host, listening.port)
     # Only now: it loads all that computes and draws, which takes seconds.
@@ -142,18 +158,18 @@ def train(
         overrides["ratings.pretrain"], overrides["ratings.online"] = split_ratings(ratings)
     if steps is not None:
         overrides["rollouts.total_steps"] = steps
-    config = load_config(options.config, overrides)
+    demo, config = options.found(overrides)
 
     from onedemo.core.files import write_atomic
-    from onedemo.demos.library import find_demo
     from onedemo.reward.warm_start import newest_snapshot
+    from onedemo.robots import registry
     from onedemo.storage.store import Store
     from onedemo.training.simulated_run import train as train_run
     from onedemo.vision.encoders import make_encoder
 
     if json_ is not None:
         check_output(json_, options.data_dir)
-    demo = find_demo(options.demo, options.data_dir / "demos")
+    registry.use(options.data_dir)
     store = Store(options.data_dir)
     try:
         start = None

@@ -17,6 +17,7 @@ from onedemo.config import RunConfig
 from onedemo.core.log_limit import limit_logs
 from onedemo.core.process import end_within
 from onedemo.render.drawing_process import DrawingProcess
+from onedemo.robots import registry
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, find_run
 from onedemo.types import Demo
@@ -62,6 +63,7 @@ def serve(
     """
     sys.setswitchinterval(_SWITCH_SECONDS)
     limit_logs()
+    registry.use(data_dir)
     store = Store(data_dir)
     renderer = DrawingProcess()
     secret = read_secret(data_dir)

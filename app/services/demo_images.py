@@ -21,6 +21,8 @@ from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
 from onedemo.render.framing import film_sides
 from onedemo.render.mover import locate
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot
 from onedemo.storage.run_directory import CLIP_FORMAT
 from onedemo.storage.store import Store
 from onedemo.types import Demo
@@ -51,17 +53,22 @@ class Pictures:
         demo: The demo.
         read: Reads its frames, (n, H, W, 3), uint8 RGB.
         track: What its frames show of the robot, as soon as that is known; None: not yet, or nothing.
+        robot: The robot; the hopper if None.
     """
 
     def __init__(
         self, demo: Demo, read: Callable[[Demo], np.ndarray] = read_frames,
-        track: Callable[[], Track | None] = lambda: None,
+        track: Callable[[], Track | None] = lambda: None, robot: Robot | None = None,
     ) -> None:  # fmt: skip
         self.demo = demo
+        self._robot = robot or robot_named(DEFAULT)
         self._read = read
         self._track, self._choosing = track, threading.Lock()
         self._shown = shipped_track(demo)
-        self._others = {d.name: d for d in built_in() if d.fps == demo.fps and d.path != demo.path}
+        self._others = {
+            d.name: d for d in built_in()
+            if d.fps == demo.fps and d.path != demo.path and d.robot == self._robot.name
+        }  # fmt: skip
         self._length = min(demo.frames, max(2, round(_CLIP_SECONDS * demo.fps)))
         self._chosen: Examples | None = None
         self._lock = threading.Lock()
@@ -100,7 +107,7 @@ class Pictures:
                 self._shown = self._shown or self._track()
                 tracks = {name: shipped_track(demo) for name, demo in self._others.items()}
                 others = {name: track for name, track in tracks.items() if track is not None}
-                self._chosen = choose(self._shown, self.demo.frames, self._length, others)
+                self._chosen = choose(self._shown, self.demo.frames, self._length, others, self._robot)
             return self._chosen
 
     def _prepare(self) -> None:
@@ -112,15 +119,16 @@ class Pictures:
                 _log.error("%s", error)
             raise
         length, examples = self._length, dict(self._examples)
-        mover = locate(frames)
+        mover = locate(frames, self._robot)
         for source, wanted in groupby(sorted(_all_of(self._chosen), key=_source), key=_source):
             there = self._read(self._others[source]) if source else frames
-            mover_there = locate(there) if source else mover
+            mover_there = locate(there, self._robot) if source else mover
             for example in wanted:
                 left = np.arange(example.left, example.left + length)
                 right = np.arange(example.right, example.right + length)
                 movers = [mover and mover.at(left), mover_there and mover_there.at(right)]
-                examples[example.name] = compose_clip(*film_sides([frames[left], there[right]], movers))
+                sides = film_sides([frames[left], there[right]], movers, self._robot.camera)
+                examples[example.name] = compose_clip(*sides)
         self._examples = examples
         self._frames = self._frames or [_jpeg(frame) for frame in frames]
 

@@ -17,8 +17,9 @@ import mujoco
 import numpy as np
 
 from onedemo.rl.rollouts import Acting
-from onedemo.robots.registry import robot_named
-from onedemo.sim import vector_env
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot, body_name, model_of
+from onedemo.sim.vector_env import RobotVectorEnv
 
 log = logging.getLogger("onedemo.page")
 
@@ -31,11 +32,11 @@ class Moment:
     """What a watcher draws."""
 
     xpos: np.ndarray
-    """Positions of the bodies, (bodies, 3), metres; the robot's own x is taken out."""
+    """Positions of the bodies, (bodies, 3), metres; the robot's own place on the floor is taken out."""
     xmat: np.ndarray
     """Their orientations, (bodies, 3, 3)."""
-    x: float
-    """Where the robot is along its track, metres."""
+    place: np.ndarray
+    """Where the robot is on the floor, (3,), metres; 0 on each axis on which no camera follows it."""
     demo_seconds: float
     """How far along the demo it is."""
     seconds: float
@@ -53,20 +54,18 @@ class Live:
     Args:
         acting: Gives what acts in the next episode, or None while there is nothing.
         seconds: Length of an episode: the demo's.
-        environment: Name in the registry of environments.
+        robot: Which; the hopper if None.
         frames_per_second: How often watchers are called.
     """
 
     def __init__(
-        self, acting: Callable[[], Acting | None], seconds: float, environment: str = "hopper",
+        self, acting: Callable[[], Acting | None], seconds: float, robot: Robot | None = None,
         *, frames_per_second: float = 30.0,
     ) -> None:  # fmt: skip
         self._acting = acting
-        spec = robot_named(environment)
-        self.model_path = spec.xml
-        self._dt = spec.dt
-        self._horizon = max(1, round(seconds / spec.dt))
-        self._environment = environment
+        self.robot = robot or robot_named(DEFAULT)
+        self._dt = self.robot.dt
+        self._horizon = max(1, round(seconds / self._dt))
         self._pause = 1 / frames_per_second
         self._watchers: dict[object, Watcher] = {}
         self._wake = threading.Condition()
@@ -94,8 +93,8 @@ class Live:
 
     def _run(self) -> None:
         # One step more than an episode has: it is begun anew here, not by the environment.
-        env = vector_env.make(self._environment, 1, horizon=self._horizon + 1, nthread=0)
-        model = mujoco.MjModel.from_xml_path(str(self.model_path))
+        env = RobotVectorEnv(self.robot, 1, horizon=self._horizon + 1, nthread=0)
+        model = model_of(self.robot.xml)
         data = mujoco.MjData(model)
         obs, _ = env.reset(seed=0)
         acting: Acting | None = None
@@ -139,17 +138,34 @@ class Live:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        x = float(data.subtree_com[0, 0])  # What the camera of the clips follows, too.
+        place = followed(self.robot) * data.subtree_com[_root(model, self.robot)]
         xpos = data.xpos.copy()
-        xpos[1:, 0] -= x
+        xpos[1:] -= place
         return Moment(
             xpos=xpos,
             xmat=data.xmat.reshape(-1, 3, 3).copy(),
-            x=x,
+            place=place,
             demo_seconds=clock * self._dt,
             seconds=elapsed * self._dt,
             acting=acting,
         )
+
+
+def followed(robot: Robot) -> np.ndarray:
+    """On which world axes a camera follows the robot, (3,): 1 there, else 0; as that of the clips."""
+    camera, axes = robot.camera, np.eye(3)
+    if not camera.follows:
+        return np.zeros(3)
+    across = axes[camera.right]
+    if camera.up != 2:
+        return across + axes[camera.up]
+    return across + np.abs(camera.forward) if robot.root == "free" else across
+
+
+def _root(model: mujoco.MjModel, robot: Robot) -> int:
+    """The body whose parts' centre of mass is followed."""
+    names = [body_name(model, body) for body in range(model.nbody)]
+    return int(model.body_rootid[names.index(robot.limbs[0])])
 
 
 def steps_due(behind: float, dt: float) -> int:

@@ -18,7 +18,7 @@ from onedemo.core.log_limit import LogLimit
 from onedemo.core.names import check_description
 from onedemo.demos.library import find_demo, list_demos
 from onedemo.errors import UserError
-from onedemo.render.renderer import Drawing
+from onedemo.render.render_thread import Drawing
 from onedemo.reward.model import Snapshot, check_start
 from onedemo.reward.warm_start import newest_snapshot
 from onedemo.storage.run_directory import RunDirectory
@@ -30,7 +30,8 @@ from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
 
 OFFERED = (
-    "ratings.pretrain", "ratings.online", "rollouts.total_steps", "ratings.clip_seconds", "ratings.choice",
+    "env", "ratings.pretrain", "ratings.online", "rollouts.total_steps", "ratings.clip_seconds",
+    "ratings.choice",
 )  # fmt: skip
 """Settings that a new run may be given in the browser, besides method and seed. The others are as in the
 run at hand."""
@@ -130,12 +131,13 @@ class Study:
                 raise UserError(f"there is no method {method!r}; choose from: {', '.join(METHODS)}")
             kept = settings_for_another(self.trainer.config, method)
             chosen = {key: value for key, value in (settings or {}).items() if key in OFFERED}
-            config = load_config(None, kept | chosen | {"seed": seed, "device": self._device})
+            found = find_demo(demo, self._data_dir / "demos")
+            robot = {"env": found.robot or self.trainer.config.env}
+            config = load_config(None, kept | robot | chosen | {"seed": seed, "device": self._device})
             start = None
             if predictor_from is not None:
                 start = newest_snapshot(self._store, self._data_dir, predictor_from)
                 check_start(Snapshot.load(start), config.predictor)
-            found = find_demo(demo, self._data_dir / "demos")
             run = add_run(self._store, self._data_dir, found, config, name=name)
             self._switch(run, found, config, start=start)
             return run

@@ -58,6 +58,7 @@ class Start:
         self._context, self._store, self._run = context, context.store, context.run
         self._shown = False
         self._looked_at = -_EVERY_S
+        self._left_out: set[int] = set()
         self._content: dict[int, str] = {}
         self._iteration = 0
         self._best: dict[str, Any] | None = None
@@ -79,14 +80,18 @@ class Start:
 
     def refresh(self, status: Status) -> None:
         """Steps and people, if somebody looks."""
-        if not self._shown or time.monotonic() - self._looked_at < _EVERY_S:
+        if not self._shown:
             return
-        self._looked_at = time.monotonic()
         store, run = self._store, self._run
+        left_out = store.ratings.left_out(run)
+        # Who is excluded or included is seen at once: somebody has pressed a button and waits.
+        if left_out == self._left_out and time.monotonic() - self._looked_at < _EVERY_S:
+            return
+        self._looked_at, self._left_out = time.monotonic(), left_out
         given: Counter[str] = Counter()
         for (name, _), counts in store.ratings.tallies(run).items():
             given[name] += sum(counts)
-        everybody, left_out = store.accounts.raters(), store.ratings.left_out(run)
+        everybody = store.accounts.raters()
         people = people_of(
             everybody, store.accounts.links(), store.accounts.presence(), given, left_out,
             now=datetime.fromisoformat(now()),
@@ -97,7 +102,8 @@ class Start:
                 self._best = row
         outside = {rater.name for rater in everybody if rater.id in left_out}
         steps = render(
-            "start.html:steps", run=run, demo=self._context.demo.name, status=status, people=people,
+            "start.html:steps", run=run, demo=self._context.demo.name, robot=self._context.live.robot.name,
+            status=status, people=people,
             given=[(name, count) for name, count in given.most_common() if name not in outside],
             left_out=sum(given[name] for name in outside), best=self._best, halted=status.phase in HALTED,
             version=self._context.version, picture=self._context.demo.sha256[:8], me=self._context.rater.id,

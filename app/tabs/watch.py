@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
+import numpy as np
 from markupsafe import Markup
-from mjviser import ViserMujocoScene
 
 from onedemo.app.annotation.phases import NAMES, told
 from onedemo.app.annotation.scale import ANSWERS
@@ -21,19 +22,24 @@ from onedemo.app.tabs import charts, progress
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.errors import UserError
+from onedemo.render.studio import colours_of
+from onedemo.robots.camera import Camera, visible_geoms
+from onedemo.robots.robot import Robot
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
+
+if TYPE_CHECKING:
+    from mjviser import ViserMujocoScene
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""
 _CONFIRM_SECONDS = 5.0
 _APART_SECONDS = 0.1
 """If the demo is further from the robot's own time than this, both times are told."""
-# As in the clips, so that robot and demo have one scale; the mouse turns it.
-_CAMERA_POSITION = (0.0, -3.0, 1.02)
-_CAMERA_TARGET = (0.0, 0.0, 1.02)
-_CAMERA_FOV = 45.0
-_LIMBS = ((0.91, 0.29, 0.17, 1.0), (0.13, 0.25, 0.47, 1.0), (0.20, 0.48, 0.76, 1.0), (0.97, 0.69, 0.15, 1.0))
+_CAMERA_FOV, _HIGHER = 45.0, 0.14
+"""A little wider than in the clips, and so much higher of the robot's size, metres; the mouse turns it."""
+_DEEPER = 1.45
+"""Exponent of a limb's colour: the browser's tone mapping makes colours paler than they are in clips."""
 
 
 class Watch:
@@ -162,25 +168,29 @@ class Watch:
     # The robot
 
     def _build_scene(self) -> None:
+        from mjviser import ViserMujocoScene  # 0.4 s, for who sees the robot
+
+        camera = self._live.robot.camera
         # A model of its own, as the scene writes into it; without the floor, which is drawn calmer here.
-        scene = ViserMujocoScene(self._client, drawn_model(self._live.model_path), num_envs=1)  # type: ignore[arg-type]
+        scene = ViserMujocoScene(self._client, drawn_model(self._live.robot), num_envs=1)  # type: ignore[arg-type]
         scene.camera_tracking_enabled = False
         # Two lamps instead of an environment map, whose shaders hold a browser without a GPU for seconds.
         shown = self._client.scene
         shown.configure_environment_map(None)
         shown.configure_default_lights(False)
-        shown.add_light_directional("/lights/key", intensity=3.0, position=(0.5, -1.5, 4.0), cast_shadow=True)
-        shown.add_light_directional("/lights/fill", intensity=1.5, position=(-1.5, -4.0, -1.0))
+        shown.add_light_directional("/lights/key", intensity=3.2, position=(0.5, -1.5, 4.0), cast_shadow=True)
+        shown.add_light_directional("/lights/fill", intensity=1.6, position=(-1.5, -4.0, -1.0))
         shown.add_grid(
             "/fixed_bodies/floor",
             infinite_grid=True,
-            cell_size=0.5,
-            section_size=1.0,
+            cell_size=0.5 * camera.unit,
+            section_size=camera.unit,
             cell_color=(206, 214, 223),
             section_color=(182, 193, 205),
-            fade_distance=22.0,
+            fade_distance=22.0 * camera.unit,
             shadow_opacity=0.22,
             plane_opacity=0.0,
+            position=(0.0, 0.0, camera.floor),
         )
         self._scene = scene
         self._look()
@@ -189,9 +199,7 @@ class Watch:
         """Looks at the robot as the demonstration does."""
         camera = self._client.camera
         with self._client.atomic():
-            camera.up_direction = (0.0, 0.0, 1.0)
-            camera.position = _CAMERA_POSITION
-            camera.look_at = _CAMERA_TARGET
+            camera.up_direction, camera.position, camera.look_at = view_of(self._live.robot.camera)
             camera.fov = math.radians(_CAMERA_FOV)
 
     def _draw(self, moment: Moment) -> None:
@@ -200,7 +208,7 @@ class Watch:
             return
         with self._client.atomic():
             scene.update_from_arrays(moment.xpos[None], moment.xmat[None])
-            scene.fixed_bodies_frame.position = (-moment.x, 0.0, 0.0)
+            scene.fixed_bodies_frame.position = tuple(-moment.place)
             frame = min(int(moment.demo_seconds * self._demo.fps), self._demo.frames - 1)
             if frame // max(1, round(self._demo.fps / _DEMO_HZ)) != self._frame:
                 self._frame = frame // max(1, round(self._demo.fps / _DEMO_HZ))
@@ -244,14 +252,36 @@ def time_html(demo_seconds: float, seconds: float, length: float, note: str) -> 
     )  # fmt: skip
 
 
-def drawn_model(path: Path) -> mujoco.MjModel:
+def view_of(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """From where the live robot is seen, but for its place as far as a camera follows it.
+
+    Returns:
+        The direction up, the camera's place and what it looks at, (3,) each.
+    """
+    right, up, _ = axes = np.eye(3)[[camera.right, camera.up, 2]]
+    target = camera.middle * right + camera.depth * np.abs(camera.forward)
+    if camera.up == 2:
+        target = target + (camera.height + _HIGHER * camera.size + camera.floor) * axes[2]
+    elif not camera.follows:
+        target = target + camera.height * up
+    return up, target - camera.distance * camera.forward, target
+
+
+def drawn_model(robot: Robot) -> mujoco.MjModel:
     """The robot without its floor, each limb in the colour it has in the clips."""
-    spec = mujoco.MjSpec.from_file(str(path))
-    for geom in list(spec.geoms):
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            spec.delete(geom)
-    model = spec.compile()
-    for geom in range(model.ngeom):
-        model.geom_matid[geom] = -1
-        model.geom_rgba[geom] = _LIMBS[min(geom, len(_LIMBS) - 1)]
+    model = mujoco.MjModel.from_xml_path(str(robot.xml))
+    floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    model.geom_type[floor] = mujoco.mjtGeom.mjGEOM_SPHERE  # where a plane is, mjviser puts a floor of its own
+    seen = visible_geoms(model)
+    seen = seen[~floor[seen]]
+    colours = colours_of(robot, model)
+    model.geom_matid[:], model.geom_rgba[:, 3] = -1, 0
+    model.geom_group[seen], model.site_group[:] = 0, 5
+    for geom in seen:
+        model.geom_rgba[geom] = in_this_light(colours[geom])
     return model
+
+
+def in_this_light(colour: Sequence[float]) -> list[float]:
+    """A colour as it must be for the live view to look like a clip: RGB to RGBA, 0..1."""
+    return [*(part**_DEEPER for part in colour), 1.0]

@@ -87,10 +87,12 @@ class Page:
 
     def _attach(self, trainer: Any, pictures: Pictures | None) -> None:
         self.trainer = trainer
-        self.pictures = pictures or Pictures(trainer.demo, track=lambda: trainer.track)
+        self.pictures = pictures or Pictures(trainer.demo, track=lambda: trainer.track, robot=trainer.robot)
         self._assignment = Assignment(again=self._again)
         self._pair_assignment = Assignment()
-        self._live = Live(trainer.acting, trainer.demo.seconds, frames_per_second=self._live_fps)
+        self._live = Live(
+            trainer.acting, trainer.demo.seconds, trainer.robot, frames_per_second=self._live_fps
+        )
 
     def close(self) -> None:
         """Ends all sessions and the server behind them."""

@@ -225,6 +225,19 @@ def test_no_tab_is_wider_than_the_screen(chromium, site):
                 assert settled(page, RIGHT) <= viewport["width"], (tab, viewport)
 
 
+def test_a_browser_without_webgl_is_told(chromium, site):
+    context = chromium.new_context()
+    page = context.new_page()
+    page.add_init_script(
+        "const any = HTMLCanvasElement.prototype.getContext;"
+        " HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        " return kind.startsWith('webgl') ? null : any.call(this, kind, ...more) }"
+    )
+    page.goto(site.links["annotator"])
+    assert "needs WebGL" in page.wait_for_selector(".od-nowebgl", timeout=60_000).inner_text()
+    context.close()
+
+
 def test_held_key_gives_one_rating(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         clip = shown_clip(page)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from onedemo.rl.rollouts import Acting, EpisodeRules
+from onedemo.robots.registry import robot_named
 from onedemo.storage.clips import NewClip
 from onedemo.storage.store import Store
 from onedemo.types import Clip, Demo, Segment, Status
@@ -127,6 +128,7 @@ class StandIn:
             return self._status
 
     dt = 0.008
+    robot = robot_named("hopper")
 
     def clip_file(self, clip_id: int) -> Path:
         return self.directory / f"{clip_id:06d}.jpg"

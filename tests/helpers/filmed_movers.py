@@ -29,10 +29,20 @@ def positions(name: str, count: int = 240) -> np.ndarray:
 
 
 class Film:
-    """Pictures (F, H, W, 3), what is the mover (F, H, W), and where the camera was (F,), metres, or None."""
+    """Pictures (F, H, W, 3), and the truth.
 
-    def __init__(self, frames: np.ndarray, masks: np.ndarray, way: np.ndarray | None = None) -> None:
-        self.frames, self.masks, self.way = frames, masks, way
+    That is: what the mover is (F, H, W), where the camera was (F,), metres, and the row of the floor (F,), or
+    None.
+    """
+
+    def __init__(
+        self,
+        frames: np.ndarray,
+        masks: np.ndarray,
+        way: np.ndarray | None = None,
+        floor: np.ndarray | None = None,
+    ) -> None:
+        self.frames, self.masks, self.way, self.floor = frames, masks, way, floor
 
 
 def by_gymnasium(
@@ -57,7 +67,7 @@ def _drawn(model: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], camer
     model.vis.global_.offwidth, model.vis.global_.offheight = max(640, 2 * width), max(480, 2 * height)
     data = mujoco.MjData(model)
     view: str | mujoco.MjvCamera = camera or mujoco.MjvCamera()
-    frames, masks, way = [], [], []
+    frames, masks, way, floor = [], [], [], []
     with mujoco.Renderer(model, 2 * height, 2 * width) as renderer:
         for q in qpos:
             data.qpos[:] = q
@@ -76,7 +86,14 @@ def _drawn(model: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], camer
             share = cv2.resize(solid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             masks.append(share > 0.5)
             way.append(data.subtree_com[0, 0])
-    return Film(np.stack(frames), np.stack(masks), np.array(way) - way[0])
+            floor.append(_floor(model, data, height))
+    return Film(np.stack(frames), np.stack(masks), np.array(way) - way[0], np.array(floor))
+
+
+def _floor(model: mujoco.MjModel, data: mujoco.MjData, height: int) -> float:
+    """The row at which the tracking camera, three metres away and level, sees the floor below the robot."""
+    focal = height / 2 / np.tan(np.radians(model.vis.global_.fovy) / 2)
+    return float(height / 2 + focal * data.camera("track").xpos[2] / -model.camera("track").pos[1])
 
 
 def _top(model: mujoco.MjModel, data: mujoco.MjData) -> float:

@@ -89,7 +89,7 @@ class OwnRater(Budget):
 
     def _clips(self, segment: Segment, demo_step: int) -> tuple[np.ndarray, np.ndarray]:
         """The pictures of ``training.clip_worker``: one of the robot for each frame of the demo's clip."""
-        from onedemo.render.renderer import RenderThread
+        from onedemo.render.render_thread import RenderThread
 
         if self._frames is None:
             self._frames = read_frames(self._demo)

@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from onedemo.core import optimisers
 from onedemo.reward.two_branch_net import STANDARD_DIMS, standard_inputs
 from onedemo.types import Segment
 
@@ -174,7 +175,7 @@ def fit_reward(
     target_n = torch.tensor([c.preference for c in comparisons], dtype=torch.float32)
     n, steps, K = len(comparisons), x_n2WS.shape[2], config.members
     nets = _Nets(K, config.hidden, generator)
-    optimiser = torch.optim.AdamW(nets.parameters(), config.rate, weight_decay=config.decay, foreach=True)
+    optimiser = optimisers.AdamW(nets.parameters(), config.rate, weight_decay=config.decay, foreach=True)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.updates)
     bags_Kn = torch.randint(n, (K, n), generator=generator)
     stride = min(config.stride, steps)

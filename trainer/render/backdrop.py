@@ -4,8 +4,9 @@ Drawn here with arrays and not by MuJoCo, because the floor costs its software r
 frame at 480 x 360 (12 ms smoothed) and shimmers in the distance. Here each pixel holds the exact
 mean of the pattern over its footprint, so the floor is calm, at 3 ms, and 2 more for the shadow.
 
-Shapes: H rows, W columns, h rows below the horizon, L limbs. World axes as in MuJoCo: x along the
-robot's track, y away from the camera, z up, in metres. The camera looks along +y, level.
+Shapes: H rows, W columns, h rows below the horizon, L limbs. Axes: x to the right, along the robot's track,
+y away from the camera, z up. The camera looks along +y, level. The floor's squares have a side of 1: for a
+robot much smaller or larger than a man all lengths are in another unit than metres.
 """
 
 from __future__ import annotations
@@ -24,11 +25,10 @@ LANE = np.array((222, 227, 233), np.float32)
 SHADOW = np.array((38, 48, 66), np.float32)
 
 _LANE_HALF_WIDTH = 0.33
-_EDGE_HALF_WIDTH = 0.012
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Camera:
+class Viewpoint:
     """A level pinhole camera beside the track."""
 
     x: float
@@ -36,9 +36,12 @@ class Camera:
     z: float
     """Above the floor, metres."""
     distance: float
-    """From the robot's plane y = 0, metres."""
+    """From the robot's plane, metres."""
     fovy: float
     """Vertical field of view, degrees."""
+    y: float | None = None
+    """Where the robot's plane is, which a camera follows that a robot can come near or leave, metres; None:
+    at 0 for ever, and the track is marked on the floor."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -59,7 +62,7 @@ def whole_view(height: int, width: int, fovy: float) -> Window:
 
 
 def backdrop(
-    width: int, height: int, camera: Camera, limbs_L4: np.ndarray | None = None, *, exact: bool = True,
+    width: int, height: int, camera: Viewpoint, limbs_L5: np.ndarray | None = None, *, exact: bool = True,
     window: Window | None = None,
 ) -> np.ndarray:  # fmt: skip
     """Draws sky, floor and the shadow of the limbs.
@@ -68,8 +71,8 @@ def backdrop(
         width: Pixels.
         height: Pixels.
         camera: Where the picture is taken from.
-        limbs_L4: Per limb its extent in x (low, high), the height of its lowest point and its
-            radius, all in metres, (L, 4); None for an empty floor.
+        limbs_L5: Per limb its extent in x (low, high), the height of its lowest point, half of its depth
+            and how far behind the robot's plane its middle is, metres, (L, 5); None for an empty floor.
         exact: Computes in doubles; else in half the time, with some pixels a grey level off.
         window: The part of the camera's view that fills the picture; all of it if None.
 
@@ -77,18 +80,19 @@ def backdrop(
         The picture, (H, W, 3), uint8 RGB.
     """
     window = window or whole_view(height, width, camera.fovy)
-    ground = _ground(width, height, camera.z, camera.distance, camera.fovy, window, exact)
+    track = camera.y is None
+    ground = _ground(width, height, camera.z, camera.distance, camera.fovy, window, track, exact)
     if ground.horizon == height:
         return cv2.merge(ground.sky)
     x_hW1 = ground.x_hW1 + np.float32(camera.x)
     light_hW = _wave(x_hW1)
     light_hW /= ground.pixel_h1
     light_hW *= 0.5
-    light_hW *= ground.wave_y_h1
+    light_hW *= ground.wave_y_h1 if camera.y is None else ground.wave_y(camera.y)
     light_hW += 0.5
     clear = None
-    if limbs_L4 is not None and len(limbs_L4):
-        clear = _shadow(ground, x_hW1, limbs_L4)
+    if limbs_L5 is not None and len(limbs_L5):
+        clear = _shadow(ground, x_hW1, limbs_L5)
 
     # Colour by colour: an inner loop over three bytes would cost as much as all the rest.
     planes = []
@@ -116,6 +120,8 @@ class _Ground:
     """Whole pictures, a plane each of red, green and blue, (H, W), uint8."""
     y_h: np.ndarray
     """Of each row of the floor, metres, (h,)."""
+    y_size_h: np.ndarray
+    """What each of them covers, metres, (h,)."""
     x_hW1: np.ndarray
     """Of the borders of its pixels, from the camera, metres, (h, W + 1)."""
     pixel_h1: np.ndarray
@@ -129,10 +135,14 @@ class _Ground:
     near: slice
     """Rows that can be in shadow."""
 
+    def wave_y(self, y: float) -> np.ndarray:
+        """As ``wave_y_h1``, where the robot's plane is elsewhere."""
+        return _mean_wave(self.y_h + y % 2, self.y_size_h)[:, None].astype(self.pixel_h1.dtype)
+
 
 @lru_cache(8)
 def _ground(
-    width: int, height: int, z: float, distance: float, fovy: float, window: Window, exact: bool
+    width: int, height: int, z: float, distance: float, fovy: float, window: Window, track: bool, exact: bool
 ) -> _Ground:
     """The camera keeps its height but for jumps, so this is computed once a clip."""
     focal = window.focal
@@ -148,23 +158,25 @@ def _ground(
     y_h = depth_h - distance
     y_size_h = depth_h**2 / (z * focal)
     edges_W1 = (np.arange(width + 1, dtype=np.float32) - window.column) / focal
-    wave_y_h = (_triangle(y_h + y_size_h / 2) - _triangle(y_h - y_size_h / 2)) / y_size_h
+    wave_y_h = _mean_wave(y_h, y_size_h)
 
     # Row by row every colour is a blend of two, so the rest is one multiplication per pixel.
     dark_h3 = np.broadcast_to(CHECK_DARK, (len(y_h), 3))
     lift_h3 = np.broadcast_to(CHECK_LIGHT - CHECK_DARK, (len(y_h), 3))
-    lane_h1 = _covered(y_h, y_size_h, -_LANE_HALF_WIDTH, _LANE_HALF_WIDTH)[:, None] * 0.6
-    dark_h3 = dark_h3 + lane_h1 * (LANE - dark_h3)
-    lift_h3 = lift_h3 * (1 - lane_h1)
+    if track:
+        lane_h1 = _covered(y_h, y_size_h, -_LANE_HALF_WIDTH, _LANE_HALF_WIDTH)[:, None] * 0.6
+        dark_h3 = dark_h3 + lane_h1 * (LANE - dark_h3)
+        lift_h3 = lift_h3 * (1 - lane_h1)
     fog_h1 = 1 - np.exp(-np.maximum(depth_h - distance, 0) / 4.5)[:, None]
     dark_h3 = dark_h3 + fog_h1 * (SKY_HORIZON - dark_h3)
     lift_h3 = lift_h3 * (1 - fog_h1)
-    near = np.flatnonzero(np.abs(y_h) < 0.7)
+    near = np.flatnonzero(np.abs(y_h) < (0.7 if track else 1.6))
     kind = np.float64 if exact else np.float32
     return _Ground(
         horizon=horizon,
         sky=[np.ascontiguousarray(sky[:, :, colour]) for colour in range(3)],
         y_h=y_h.astype(kind),
+        y_size_h=y_size_h,
         x_hW1=(depth_h[:, None] * edges_W1).astype(kind),
         pixel_h1=(depth_h[:, None] / np.float32(focal)).astype(kind),
         wave_y_h1=wave_y_h[:, None].astype(kind),
@@ -185,6 +197,11 @@ def _triangle(x: np.ndarray) -> np.ndarray:
     return 1 - np.abs(np.mod(x, 2) - 1)
 
 
+def _mean_wave(y_h: np.ndarray, size_h: np.ndarray) -> np.ndarray:
+    """Mean of the square wave over each row's footprint, (h,), -1..1."""
+    return (_triangle(y_h + size_h / 2) - _triangle(y_h - size_h / 2)) / size_h
+
+
 def _covered(y_h: np.ndarray, size_h: np.ndarray, low: float, high: float) -> np.ndarray:
     """Which part of each row's footprint lies in low..high, (h,), 0..1."""
     overlap = np.minimum(y_h + size_h / 2, high) - np.maximum(y_h - size_h / 2, low)
@@ -203,16 +220,37 @@ def _wave(x_hW1: np.ndarray) -> np.ndarray:
     return edge[:, 1:] - edge[:, :-1]
 
 
-def _shadow(ground: _Ground, x_hW1: np.ndarray, limbs_L4: np.ndarray) -> np.ndarray:
+def _shadow(ground: _Ground, x_hW1: np.ndarray, limbs_L5: np.ndarray) -> np.ndarray:
     """How dark it is under the limbs, 0..1, (near rows, W): the higher a limb, the fainter and softer."""
-    y = np.abs(ground.y_h[ground.near])
+    y = ground.y_h[ground.near]
     x = (x_hW1[ground.near, 1:] + x_hW1[ground.near, :-1]) / 2
     clear = np.ones_like(x)
-    for low, high, lift, radius in limbs_L4.astype(np.float32):
+    for low, high, lift, half, middle in limbs_L5.astype(np.float32):
         lift = max(float(lift), 0.0)
         soft = 0.035 + 0.16 * lift
         dark = 0.6 * np.exp(-lift / 0.9)
-        across = np.exp(-((np.maximum(y - radius * 0.6, 0) / (soft * 1.2)) ** 2))
+        across = np.exp(-((np.maximum(np.abs(y - middle) - half * 0.6, 0) / (soft * 1.2)) ** 2))
         along = 0.5 * (np.tanh((x - low) / soft) - np.tanh((x - high) / soft))
         clear *= 1 - (dark * across[:, None]).astype(np.float32) * along
     return 1 - clear
+
+
+def ground_from_above(width: int, height: int, camera: Viewpoint, window: Window) -> np.ndarray:
+    """Draws the plain ground that a camera sees which looks straight down.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        camera: Its ``z`` is its place along the picture's vertical axis, its distance that from the ground.
+        window: The part of the camera's view that fills the picture.
+
+    Returns:
+        The picture, (H, W, 3), uint8 RGB.
+    """
+    pixel = camera.distance / window.focal
+    x_W1 = camera.x + (np.arange(width + 1) - window.column) * pixel
+    z_H1 = camera.z + (window.row - np.arange(height + 1)) * pixel
+    waves = [np.diff(_triangle(edges)).astype(np.float32) / pixel for edges in (x_W1, z_H1)]
+    light_HW = np.multiply.outer(-waves[1], waves[0])
+    plain, lift = (CHECK_LIGHT + LANE) / 2, (LANE - CHECK_LIGHT) / 2
+    return (plain + lift * light_HW[:, :, None] + 0.5).astype(np.uint8)

@@ -1,7 +1,7 @@
 """Draws in a process of its own: no picture waits for Python code of page or practice, nor these for one.
 
-What goes through the pipe, pickled: a number, an order and a job there; the number, a result and an error
-back. The process ends when the other end of the pipe does, however that ends.
+What goes through the pipe, pickled: a number, an order, a job and a robot there; the number, a result and
+an error back. The process ends when the other end of the pipe does, however that ends.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from typing import Any, TypeVar
 
 from onedemo.core.process import prepare_process
 from onedemo.errors import in_words
-from onedemo.render.renderer import Order, Renderer, RenderThread
+from onedemo.render.render_thread import Order, RenderThread
+from onedemo.render.renderer import Renderer
+from onedemo.robots.robot import Robot
 
 log = logging.getLogger("onedemo")
 
@@ -44,12 +46,15 @@ class DrawingProcess:
         self._closed = False
         self._begin()
 
-    def submit(self, job: Callable[[Renderer], T], order: Order = Order.AHEAD) -> Future[T]:
+    def submit(
+        self, job: Callable[[Renderer], T], order: Order = Order.AHEAD, robot: Robot | None = None
+    ) -> Future[T]:
         """Runs ``job(renderer)`` there; of equal order in the order of submission.
 
         Args:
             job: A function of a module, or a ``partial`` of one.
             order: What it comes before, or after.
+            robot: Whose positions it draws; the hopper's if None.
 
         Returns:
             The future of what ``job`` returns or raises. It is cancelled if this is closed first, and raises
@@ -63,7 +68,7 @@ class DrawingProcess:
             if self._closed:
                 raise RuntimeError("the drawing process is closed")
             number = next(self._numbers)
-            data = pickle.dumps((number, int(order), job))
+            data = pickle.dumps((number, int(order), job, robot))
             if self._dead:
                 self._begin()
             self._waiting[number] = future
@@ -166,8 +171,9 @@ def main(descriptor: int) -> None:
         suppress(EOFError, OSError),
     ):
         while data := pipe.recv_bytes():
-            number, order, job = pickle.loads(data)
-            drawing.submit(job, Order(order)).add_done_callback(lambda done, n=number: answer(n, done))
+            number, order, job, robot = pickle.loads(data)
+            drawn = drawing.submit(job, Order(order), robot)
+            drawn.add_done_callback(lambda done, n=number: answer(n, done))
 
 
 if __name__ == "__main__":

@@ -2,10 +2,12 @@
 
 Every side follows its mover along the track. Heights are the same on all sides, from the floor where
 somebody is near it, so that a jump is seen beside a step; only movers at very different heights have a
-height each. What is known beside the pictures (heights, the way along the track, head, foot and the first
-outline) goes with them as numbers in metres, which the page draws (``static/player.js``).
+height each, and so has one that is seen from above. What is known beside the pictures (heights, the way
+along the track, the paths of head and foot and the first outline) goes with them as numbers in metres,
+which the page draws (``static/player.js``).
 
-Shapes: k moments, q positions. x is along the track, z above the floor, in metres.
+Shapes: k moments, q positions. x is along the track, z above the floor, in metres; the constants are those
+of a robot that is seen from three metres.
 """
 
 from __future__ import annotations
@@ -21,14 +23,14 @@ import numpy as np
 from onedemo.render.clip_image import Side, fit
 from onedemo.render.mover import Mover
 from onedemo.render.renderer import (
-    CAMERA_DISTANCE,
-    CAMERA_HEIGHT,
     CLOSE_HEIGHT,
     CLOSE_WIDTH,
     CloseUp,
     Renderer,
 )
-from onedemo.robots.hopper import joint_points
+from onedemo.robots.camera import Camera
+from onedemo.robots.robot import Robot, body_name, model_of
+from onedemo.sim.kinematics import body_of
 
 _BESIDE, _ABOVE, _BELOW = 0.1, 0.12, 0.2
 """What is seen around the movers, and of the floor below them with its marks; metres."""
@@ -38,8 +40,8 @@ _NEAR_FLOOR = 0.6
 """Whoever comes so low is shown with the floor, metres."""
 _APART = 2.1
 """Movers further apart in height have a height each, metres."""
-_RADIUS = 0.06  # of the robot's limbs, at most
-_GHOST = 160  # pixels a metre, of the drawing that an outline is taken from
+_FEET = 4
+"""Of so many the paths are drawn."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -54,6 +56,8 @@ class Extent:
     """Above the floor."""
     high: float
     """The same."""
+    grounded: bool = True
+    """Whether there is a floor; else heights, too, are counted from what a view aims at."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -68,25 +72,37 @@ class View:
     """Height of its lower edge."""
 
 
-def views_of(extents: Sequence[Extent]) -> list[View]:
-    """Views of one size, in which every mover stays for the whole clip."""
-    across = max(e.right - e.left for e in extents) + 2 * _BESIDE
+def views_of(extents: Sequence[Extent], size: float = 1.0) -> list[View]:
+    """Views of one size, in which every mover stays for the whole clip.
+
+    Args:
+        extents: Of the movers.
+        size: Of the robot, as ``Camera.size``.
+    """
+    across = max(e.right - e.left for e in extents) + 2 * _BESIDE * size
     low, high = min(e.low for e in extents), max(e.high for e in extents)
-    together = high - low <= _APART or all(extent.low < _NEAR_FLOOR for extent in extents)
+    level = _NEAR_FLOOR * size
+    together = all(e.grounded for e in extents) and (
+        high - low <= _APART * size or all(extent.low < level for extent in extents)
+    )
     lows, highs = ([low] * len(extents), [high] * len(extents)) if together else (
         [e.low for e in extents], [e.high for e in extents]
     )  # fmt: skip
-    bottoms = [-_BELOW if near < _NEAR_FLOOR else near - _ABOVE for near in lows]
-    tall = max(high + _ABOVE - bottom for high, bottom in zip(highs, bottoms, strict=True))
-    height = max(tall, across * CLOSE_HEIGHT / CLOSE_WIDTH, _LOWEST)
-    height = _STEP * math.ceil(height / _STEP - 1e-9)
+    bottoms = [
+        -_BELOW * size if extent.grounded and near < level else near - _ABOVE * size
+        for extent, near in zip(extents, lows, strict=True)
+    ]
+    tall = max(high + _ABOVE * size - bottom for high, bottom in zip(highs, bottoms, strict=True))
+    height = max(tall, across * CLOSE_HEIGHT / CLOSE_WIDTH, _LOWEST * size)
+    step = _STEP * size
+    height = step * math.ceil(height / step - 1e-9)
     return [
         View(
             width=height * CLOSE_WIDTH / CLOSE_HEIGHT,
             height=height,
             shift=(extent.left + extent.right) / 2,
             # What is left over is above, but for some of the floor.
-            bottom=bottom - min(0.15, (height - (high + _ABOVE - bottom)) / 3),
+            bottom=bottom - min(0.15 * size, (height - (high + _ABOVE * size - bottom)) / 3),
         )
         for extent, bottom, high in zip(extents, bottoms, highs, strict=True)
     ]
@@ -103,27 +119,28 @@ def clip_sides(
         mover: What moves in just these; None where that is unknown: they are shown whole.
         robots: Positions, (k, q) each.
     """
-    tracks = [_Track.of(qpos) for qpos in robots]
+    camera = renderer.robot.camera
+    tracks = [_Track.of(renderer, qpos) for qpos in robots]
     extents = [track.extent for track in tracks]
     if mover is None:
-        views = views_of(extents)
+        views = views_of(extents, camera.size)
         return [_whole(film), *(_drawn(renderer, *pair) for pair in zip(tracks, views, strict=True))]
-    first, *others = views_of([_extent(mover), *extents])
+    first, *others = views_of([_extent(mover), *extents], camera.size)
     if _beyond(film, mover, first):
         return clip_sides(renderer, film, None, robots)
     drawn = [_drawn(renderer, *pair) for pair in zip(tracks, others, strict=True)]
-    return [_cut(film, mover, first), *drawn]
+    return [_cut(film, mover, first, camera), *drawn]
 
 
-def film_sides(films: Sequence[np.ndarray], movers: Sequence[Mover | None]) -> list[Side]:
-    """The sides of a clip of videos alone, as ``clip_sides``."""
+def film_sides(films: Sequence[np.ndarray], movers: Sequence[Mover | None], camera: Camera) -> list[Side]:
+    """The sides of a clip of videos alone, as ``clip_sides``; of a robot that is seen by that camera."""
     if any(mover is None for mover in movers):
         return [_whole(film) for film in films]
     known = [mover for mover in movers if mover is not None]
-    views = views_of([_extent(mover) for mover in known])
+    views = views_of([_extent(mover) for mover in known], camera.size)
     if any(_beyond(*side) for side in zip(films, known, views, strict=True)):
         return [_whole(film) for film in films]
-    return [_cut(*side) for side in zip(films, known, views, strict=True)]
+    return [_cut(*side, camera) for side in zip(films, known, views, strict=True)]
 
 
 # Videos
@@ -149,7 +166,7 @@ def _whole(film: np.ndarray) -> Side:
     return Side(pictures=np.stack([fit(frame, CLOSE_WIDTH, CLOSE_HEIGHT) for frame in film]))
 
 
-def _cut(film: np.ndarray, mover: Mover, view: View) -> Side:
+def _cut(film: np.ndarray, mover: Mover, view: View, camera: Camera) -> Side:
     """The view of a video at its own size: the page enlarges it, which costs nobody a larger file."""
     count, height, width = film.shape[:3]
     scale = mover.scale
@@ -175,14 +192,14 @@ def _cut(film: np.ndarray, mover: Mover, view: View) -> Side:
         return np.stack([way + (track[:, 0] - middle) / scale, (mover.floor - track[:, 1]) / scale], axis=1)
 
     known: dict[str, Any] = {
-        "seen": _numbers(seen), "offsets": _numbers(offsets), "width": round(view.width, 3),
+        "seen": _numbers(seen), "offsets": _numbers(offsets), "width": round(view.width, 4),
         "left": _numbers(way + (left - middle) / scale),
-        "bottom": round(float((mover.floor - top[0] - tall) / scale), 3),
+        "bottom": round(float((mover.floor - top[0] - tall) / scale), 4),
     }  # fmt: skip
     if mover.way is not None:
-        known |= {"eye": _numbers(way), "camera": [CAMERA_HEIGHT, CAMERA_DISTANCE]}
+        known |= {"eye": _numbers(way)} | _measures(camera)
     if mover.head is not None and mover.foot is not None:
-        known |= {"head": _numbers(place(mover.head)), "foot": _numbers(place(mover.foot))}
+        known["marks"] = [["Head", _numbers(place(mover.head))], ["Foot", _numbers(place(mover.foot))]]
     if len(mover.outlines[0]) > 2:
         x, z = mover.outlines[0].T
         known["ghost"] = _numbers(
@@ -211,21 +228,34 @@ class _Track:
     """A robot's way through a clip."""
 
     qpos: np.ndarray
-    points: dict[str, np.ndarray]
+    low: np.ndarray
+    """The least x and z that it reaches, (k, 2)."""
+    high: np.ndarray
+    """The most."""
     aim: np.ndarray
+    """The x that a view keeps in its middle, (k,)."""
+    rise: np.ndarray | None
+    """The z that a view from above keeps in its middle, (k,)."""
 
     @staticmethod
-    def of(qpos: np.ndarray) -> _Track:
-        points = joint_points(qpos)
-        return _Track(qpos, points, np.mean([point[:, 0] for point in points.values()], axis=0))
+    def of(renderer: Renderer, qpos: np.ndarray) -> _Track:
+        shapes, camera = renderer.shapes(qpos), renderer.robot.camera
+        low = np.stack([shape.low[:, (0, 2)].min(axis=0) for shape in shapes])
+        high = np.stack([shape.high[:, (0, 2)].max(axis=0) for shape in shapes])
+        if not camera.follows:
+            aim = np.full((len(qpos), 2), (camera.middle, camera.height))
+        else:  # the mean of its limbs: steadier than the edges of what it reaches
+            ends = np.stack(list(body_of(renderer.robot).points(qpos).values()))
+            aim = ends.mean(axis=(0, 2))
+        return _Track(qpos, low, high, aim[:, 0], aim[:, 1] if camera.up != 2 else None)
 
     @property
     def extent(self) -> Extent:
-        every = np.stack(list(self.points.values()))
-        x, z = every[..., 0] - self.aim, every[..., 1]
+        rise = np.zeros(len(self.aim)) if self.rise is None else self.rise
         return Extent(
-            left=float(x.min() - _RADIUS), right=float(x.max() + _RADIUS),
-            low=float(z.min() - _RADIUS), high=float(z.max() + _RADIUS),
+            left=float((self.low[:, 0] - self.aim).min()), right=float((self.high[:, 0] - self.aim).max()),
+            low=float((self.low[:, 1] - rise).min()), high=float((self.high[:, 1] - rise).max()),
+            grounded=self.rise is None,
         )  # fmt: skip
 
 
@@ -234,32 +264,78 @@ def _drawn(renderer: Renderer, track: _Track, view: View) -> Side:
     close = CloseUp(
         width=CLOSE_WIDTH, height=CLOSE_HEIGHT, scale=CLOSE_HEIGHT / view.height, bottom=view.bottom
     )
-    foot = (track.points["heel"] + track.points["toe"]) / 2
     known = {
-        "width": round(view.width, 3), "left": _numbers(middle - view.width / 2),
-        "bottom": round(view.bottom, 3), "eye": _numbers(middle),
-        "camera": [CAMERA_HEIGHT, CAMERA_DISTANCE],
-        "head": _numbers(track.points["top"]), "foot": _numbers(foot),
-        "ghost": _numbers(_silhouette({name: point[0] for name, point in track.points.items()})),
+        "width": round(view.width, 4), "left": _numbers(middle - view.width / 2),
+        "marks": [[word, _numbers(path)] for word, path in marks(renderer.robot, track.qpos)],
+        "ghost": _numbers(renderer.outline(track.qpos[0])),
     }  # fmt: skip
-    return Side(pictures=renderer.close_ups(track.qpos, middle, close), known=known)
+    if track.rise is None:
+        known |= {"bottom": round(view.bottom, 4), "eye": _numbers(middle)} | _measures(renderer.robot.camera)
+    else:
+        known["bottom"] = _numbers(track.rise + view.bottom)
+    return Side(pictures=renderer.close_ups(track.qpos, middle, close, track.rise), known=known)
 
 
-_LIMBS = (("top", "hip", 0.05), ("hip", "knee", 0.05), ("knee", "ankle", 0.04), ("heel", "toe", 0.06))
+def _measures(camera: Camera) -> dict[str, Any]:
+    """What the page must know to draw a scale of metres."""
+    return {"camera": [camera.height, camera.distance], "unit": camera.unit}
 
 
-def _silhouette(points: dict[str, np.ndarray]) -> np.ndarray:
-    """The outline of a pose, (n, 2), metres; of its joints, (2,) each."""
-    corner = np.min(list(points.values()), axis=0) - 0.1
-    extent = np.max(list(points.values()), axis=0) + 0.1 - corner
-    drawing = np.zeros((math.ceil(extent[1] * _GHOST), math.ceil(extent[0] * _GHOST)), np.uint8)
-    for begin, end, radius in _LIMBS:
-        ends = [tuple(int(v) for v in (points[name] - corner) * _GHOST) for name in (begin, end)]
-        cv2.line(drawing, ends[0], ends[1], 1, round(2 * radius * _GHOST))
-    found, _ = cv2.findContours(drawing, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return corner + cv2.approxPolyDP(max(found, key=cv2.contourArea), 1.0, True)[:, 0] / _GHOST
+def marks(robot: Robot, qpos: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """The paths that are drawn through a clip, with a word for each that is named.
+
+    Of a robot that moves about these are its head, the end of its root that is higher at rest, or that is in
+    front, and its feet; of one that stays where it is, the end that reaches farthest.
+
+    Args:
+        robot: The robot.
+        qpos: Positions, (k, q).
+
+    Returns:
+        Of each its word, "" for further feet, and its places, (k, 2): to the right and above the floor.
+    """
+    body, camera = body_of(robot), robot.camera
+    rest = body.points(model_of(robot.xml).qpos0)
+    now = body.points(qpos)
+    ground = np.array([0.0, camera.floor if camera.up == 2 else 0.0])
+    root = robot.limbs[0]
+    if robot.root == "fixed":
+        begin = rest[root].mean(axis=0)
+        far = max(robot.limbs, key=lambda name: np.linalg.norm(rest[name] - begin, axis=1).max())
+        end = int(np.linalg.norm(rest[far] - begin, axis=1).argmax())
+        return [("Tip", now[far][..., end, :] - ground)]
+    top = int(rest[root][:, 1 if camera.up == 2 else 0].argmax())
+    found = [("Head", now[root][..., top, :] - ground)]
+    for number, name in enumerate(_feet(robot, rest)):
+        rise = abs(rest[name][1, 1] - rest[name][0, 1])
+        upright = rise > 0.5 * np.linalg.norm(rest[name][1] - rest[name][0])
+        # Of what stands upright, its lower end; else its middle.
+        place = now[name][..., int(rest[name][:, 1].argmin()), :] if upright else now[name].mean(axis=-2)
+        found.append(("" if number else "Foot" if camera.up == 2 else "Tail", place - ground))
+    return found
+
+
+def _feet(robot: Robot, rest: dict[str, np.ndarray]) -> list[str]:
+    """What it stands on; seen from above, what is farthest from its head."""
+    if robot.feet:
+        return list(robot.feet[:_FEET])
+    others = [name for name in robot.limbs if name != robot.limbs[0]]
+    if robot.camera.up != 2:
+        head = rest[robot.limbs[0]].mean(axis=0)
+        return sorted(others, key=lambda name: -np.linalg.norm(rest[name].mean(axis=0) - head))[:1]
+    low = {name: float(rest[name][:, 1].min()) for name in others}
+    near = 0.05 * robot.camera.size
+    return [name for name in _outermost(robot) if low[name] < min(low.values()) + near][:_FEET]
+
+
+def _outermost(robot: Robot) -> list[str]:
+    """Limbs that carry no other, without the root."""
+    model = model_of(robot.xml)
+    number = {body_name(model, body): body for body in range(model.nbody)}
+    inner = {int(model.body_parentid[number[name]]) for name in robot.limbs}
+    return [name for name in robot.limbs[1:] if number[name] not in inner]
 
 
 def _numbers(values: Any) -> list[Any]:
-    """As JSON, to the millimetre or the thousandth of a pixel."""
-    return np.round(np.asarray(values, float), 3).tolist()
+    """As JSON, to a tenth of a millimetre or the thousandth of a pixel."""
+    return np.round(np.asarray(values, float), 4).tolist()

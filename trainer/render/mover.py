@@ -17,12 +17,18 @@ import cv2
 import numpy as np
 
 from onedemo.render.backdrop import SKY_HORIZON, SKY_TOP
-from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FREE_ABOVE, LIMB_COLOURS, studio
+from onedemo.render.renderer import studio
+from onedemo.render.stage import free_above
+from onedemo.render.studio import LIMB_COLOURS
+from onedemo.robots.camera import Camera
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot
 
 _CALM = 4.0  # pictures over which a view's way is smoothed
 _MOST = 0.15  # of a picture: what differs from the median when one body moves
 BODY = 1.45
-"""Length at which a mover of unknown size is shown, metres: the robot's own, stretched out."""
+"""Length at which a mover of unknown size is shown, metres, beside a robot that is seen from three metres:
+the robot's own, stretched out."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -56,16 +62,18 @@ class Mover:
         return replace(self, **tracks, outlines=tuple(self.outlines[frame] for frame in frames))
 
 
-def locate(frames: np.ndarray) -> Mover | None:
+def locate(frames: np.ndarray, robot: Robot | None = None) -> Mover | None:
     """Finds what moves.
 
     Args:
         frames: (F, H, W, 3), uint8 RGB.
+        robot: Whose studio it is if it is a studio, and how large what moves is shown; the hopper if None.
 
     Returns:
         None if it cannot be told from what is around it.
     """
-    return _in_studio(frames) if is_studio(frames) else _before_background(frames)
+    robot = robot or robot_named(DEFAULT)
+    return _in_studio(frames, robot) if is_studio(frames) else _before_background(frames, robot)
 
 
 def is_studio(frames: np.ndarray) -> bool:
@@ -80,9 +88,10 @@ def is_studio(frames: np.ndarray) -> bool:
     return bool(np.abs(np.median(some, axis=2) - sky).mean() < 4)
 
 
-def _in_studio(frames: np.ndarray) -> Mover | None:
+def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     height, width = frames.shape[1:3]
-    view = studio(width, height)
+    camera = robot.camera
+    view = studio(width, height, camera)
     box = np.full((len(frames), 4), np.nan)
     torso, foot = np.full((len(frames), 4), np.nan), np.full((len(frames), 2), np.nan)
     solids = np.stack([solid_in_studio(frame) for frame in frames])
@@ -105,13 +114,13 @@ def _in_studio(frames: np.ndarray) -> Mover | None:
         if (feet := places[limb == 3]).size > 20:
             foot[index] = feet.mean(axis=0)
     # Where the camera rises with the robot, heights are not known.
-    top = height - (CAMERA_HEIGHT + FREE_ABOVE - 0.03 - view.bottom) * view.scale
+    top = height - (camera.height + free_above(camera) - 0.03 * camera.size - view.bottom) * view.scale
     if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
         return None
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
         aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot),
-        way=way_in_studio(frames, solids), outlines=tuple(outlines),
+        way=way_in_studio(frames, solids, camera), outlines=tuple(outlines),
     )  # fmt: skip
 
 
@@ -120,19 +129,21 @@ def solid_in_studio(frame: np.ndarray) -> np.ndarray:
     red, green, blue = cv2.split(frame)
     bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
     solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
-    return cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    return cv2.medianBlur(solid, 3)
 
 
-def way_in_studio(frames: np.ndarray, solids: np.ndarray) -> np.ndarray:
+def way_in_studio(frames: np.ndarray, solids: np.ndarray, camera: Camera | None = None) -> np.ndarray:
     """Metres that the studio's camera has gone along the track since the first picture, (F,).
 
     Args:
         frames: (F, H, W, 3), uint8 RGB.
         solids: Where the floor is not seen, (F, H, W), uint8 0 or 1.
+        camera: The studio's; the hopper's if None.
     """
-    pattern = _floor_pattern(*frames.shape[1:3])
+    camera = camera or robot_named(DEFAULT).camera
+    pattern = _floor_pattern(*frames.shape[1:3], camera)
     places = [_place(frame[..., 1], solid, pattern) for frame, solid in zip(frames, solids, strict=True)]
-    way = np.unwrap(places, period=2)
+    way = np.unwrap(places, period=2) * camera.unit
     return way - way[0]
 
 
@@ -163,15 +174,16 @@ def _ends(rods: np.ndarray) -> np.ndarray:
     return told[:, :2] + (told[:, 2:] if agree >= 0 else -told[:, 2:])
 
 
-def _floor_pattern(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def _floor_pattern(height: int, width: int, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Some rows of the floor, (r,), and its squares in them from many places of the camera, (P, r * W).
 
     The places are a centimetre apart, over the two metres after which the squares come again.
     """
-    focal = studio(width, height).scale * CAMERA_DISTANCE
+    distance = camera.distance / camera.unit
+    focal = studio(width, height, camera).scale * camera.distance
     rows = np.arange(height // 2, height)
-    depth = CAMERA_HEIGHT * focal / (rows + 0.5 - height / 2)
-    y = depth - CAMERA_DISTANCE
+    depth = camera.height / camera.unit * focal / (rows + 0.5 - height / 2)
+    y = depth - distance
     clear = (y < -0.42) & (y > -0.95) | (y > 0.5) & (y < 0.92)  # neither on the lane nor on a border
     x = depth[clear, None] * ((np.arange(width) + 0.5 - width / 2) / focal)
     sign = np.where(np.mod(y[clear], 2) < 1, 1.0, -1.0)[:, None]
@@ -197,7 +209,7 @@ def _place(green: np.ndarray, robot: np.ndarray, pattern: tuple[np.ndarray, np.n
     return (best + float(np.clip(between, -0.5, 0.5))) * 2 / _PLACES
 
 
-def _before_background(frames: np.ndarray) -> Mover | None:
+def _before_background(frames: np.ndarray, robot: Robot) -> Mover | None:
     height, width = frames.shape[1:3]
     by = max(1.0, width / 240)
     size = (round(width / by), round(height / by))
@@ -227,7 +239,7 @@ def _before_background(frames: np.ndarray) -> Mover | None:
     box = _filled(box) * by
     sides = np.maximum(box[:, 2] - box[:, 0], box[:, 3] - box[:, 1])
     return Mover(
-        scale=float(np.percentile(sides, 90)) / BODY,
+        scale=float(np.percentile(sides, 90)) / (BODY * robot.camera.size),
         floor=float(np.percentile(box[:, 3], 95)),
         box=box,
         aim=cv2.GaussianBlur((box[:, :1] + box[:, 2:3]) / 2, (1, 0), sigmaX=1, sigmaY=_CALM)[:, 0],

@@ -3,60 +3,38 @@
 The robot alone is drawn by MuJoCo, at twice the size and then averaged down (smooth edges at a
 half of the price of multisampling); sky, floor and shadow come from ``onedemo.render.backdrop``.
 The camera follows the robot along the track but keeps its height, so that a jump is seen as one;
-it rises only when the robot would leave the picture.
+it rises only when the robot would leave the picture. Where it is comes from ``onedemo.render.stage``.
 
 Shapes: T pictures, q positions, H rows, W columns.
 """
 
 from __future__ import annotations
 
-import itertools
-import logging
 import math
-import queue
 import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
-from dataclasses import dataclass, field
-from enum import IntEnum
-from functools import partial
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
-import gymnasium
 import mujoco
 import numpy as np
 
-from onedemo.core.cpu import give_way
-from onedemo.errors import UserError
-from onedemo.render.backdrop import Camera, Window, backdrop, whole_view
+from onedemo.render.backdrop import Window, whole_view
 from onedemo.render.gl_context import open_context
-
-log = logging.getLogger("onedemo")
+from onedemo.render.stage import Eye, Shape, Stage
+from onedemo.render.studio import EYE, studio_model
+from onedemo.robots.camera import FOVY, Camera
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot
 
 WIDTH, HEIGHT = 480, 360
 """Size of what is learned from and of one side of a film, pixels."""
 CLOSE_WIDTH, CLOSE_HEIGHT = 720, 540
 """Size of the robot's side of a clip, pixels: what a screen of 1440 x 900 has room for, drawn for all."""
 
-HOPPER_XML = Path(str(gymnasium.__file__)).parent / "envs/mujoco/assets/hopper.xml"
-
 _SCALE = 2
 _CLOSE_SCALE = 1.5  # close up an edge is a smaller part of the picture: half the pixels to draw and read
-LIMB_COLOURS = ((0.91, 0.29, 0.17), (0.13, 0.25, 0.47), (0.20, 0.48, 0.76), (0.97, 0.69, 0.15))
-"""From the head down. Each limb its own colour: head and foot are told apart at any angle."""
-FOVY = 39.0
-"""Vertical field of view, degrees."""
-CAMERA_HEIGHT = 0.88
-"""Metres."""
-CAMERA_DISTANCE = 3.0
-"""Of the model's camera, metres."""
-FREE_ABOVE = 0.95
-"""The robot may rise this far above the camera before the camera follows, metres."""
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,11 +51,12 @@ class CloseUp:
     """Height of the lower edge above the floor, metres."""
 
 
-def studio(width: int = WIDTH, height: int = HEIGHT) -> CloseUp:
-    """What pictures of the robot show as long as it does not rise out of them."""
-    scale = whole_view(height, width, FOVY).focal / CAMERA_DISTANCE
+def studio(width: int = WIDTH, height: int = HEIGHT, camera: Camera | None = None) -> CloseUp:
+    """What pictures of a robot, or of the hopper, show as long as it does not rise out of them."""
+    camera = camera or robot_named(DEFAULT).camera
+    scale = whole_view(height, width, FOVY).focal / camera.distance
     return CloseUp(
-        width=width, height=height, scale=float(scale), bottom=float(CAMERA_HEIGHT - height / 2 / scale)
+        width=width, height=height, scale=float(scale), bottom=float(camera.height - height / 2 / scale)
     )
 
 
@@ -87,7 +66,7 @@ class Renderer:
     Args:
         width: Pixels, even.
         height: Pixels, even.
-        model_path: The robot's MJCF file; a planar robot with a plane for a floor.
+        robot: Whose positions; the hopper if None.
         exact: Gives the same bits as ever, for what learns from pictures; else, for people, takes less than
             two thirds of the time and is a grey level off in some pixels.
 
@@ -96,12 +75,13 @@ class Renderer:
     """
 
     def __init__(
-        self, width: int = WIDTH, height: int = HEIGHT, *, model_path: str | Path = HOPPER_XML,
-        exact: bool = True,
-    ) -> None:  # fmt: skip
+        self, width: int = WIDTH, height: int = HEIGHT, *, robot: Robot | None = None, exact: bool = True
+    ) -> None:
         if width < 2 or height < 2 or width % 2 or height % 2:
             raise ValueError(f"the picture's size must be even and positive, got {width}x{height}")
         self.width, self.height = width, height
+        self.robot = robot or robot_named(DEFAULT)
+        """Whose positions it draws."""
         self._exact = exact
         self.between: Callable[[], None] = lambda: None
         """To be called by long jobs every tenth of a second: it may do something more urgent, or raise."""
@@ -109,7 +89,8 @@ class Renderer:
         # For people clips, too, are drawn, at another size.
         close = (0, 0) if exact else (int(CLOSE_HEIGHT * _CLOSE_SCALE), int(CLOSE_WIDTH * _CLOSE_SCALE))
         big = (max(height * _SCALE, close[0]), max(width * _SCALE, close[1]))
-        self._model = _studio_model(Path(model_path), width=big[1], height=big[0])
+        self._model = studio_model(self.robot, width=big[1], height=big[0])
+        self._stage = Stage(self.robot, self._model)
         self._context: Any = open_context(big[1], big[0])
         self._data = mujoco.MjData(self._model)
         self._mjr = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -118,10 +99,12 @@ class Renderer:
         for flag in ("SHADOW", "REFLECTION", "SKYBOX", "FOG", "HAZE"):
             self._scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
         self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0
+        for kind in ("TENDON", "SKIN", "FLEXVERT", "FLEXEDGE", "FLEXFACE", "FLEXSKIN"):
+            self._option.flags[getattr(mujoco.mjtVisFlag, f"mjVIS_{kind}")] = 0
         self._view = mujoco.MjvCamera()
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
-        self._view.fixedcamid = self._model.camera("track").id
-        self._distance = -float(self._model.camera("track").pos[1])
+        self._view.fixedcamid = self._model.camera(EYE).id
         self._rect = mujoco.MjrRect(0, 0, width * _SCALE, height * _SCALE)
         self._room = (big[1], big[0])
         self._pixels = np.empty(big[0] * big[1] * 3, np.uint8)
@@ -143,24 +126,23 @@ class Renderer:
         window = whole_view(self.height, self.width, FOVY)
         images = np.empty((len(qpos_Tq), self.height, self.width, 3), np.uint8)
         for image, qpos in zip(images, qpos_Tq, strict=True):
-            limbs_L4, top = self._pose(qpos)
-            camera = Camera(
-                x=float(self._data.subtree_com[0, 0]),
-                z=CAMERA_HEIGHT + max(0.0, top - CAMERA_HEIGHT - FREE_ABOVE),
-                distance=self._distance,
-                fovy=FOVY,
-            )
-            image[:] = backdrop(self.width, self.height, camera, limbs_L4, exact=self._exact)
-            self._draw(image, camera, window, limbs_L4, top, by=_SCALE, exact=self._exact)
+            shape = self._stage.pose(self._data, qpos)
+            eye = self._stage.eye(self._data, shape)
+            image[:] = self._stage.backdrop(self.width, self.height, eye, window, shape, exact=self._exact)
+            self._draw(image, eye, window, shape, by=_SCALE, exact=self._exact)
         return images
 
-    def close_ups(self, qpos_kq: np.ndarray, x_k: np.ndarray, close: CloseUp) -> np.ndarray:
+    def close_ups(
+        self, qpos_kq: np.ndarray, x_k: np.ndarray, close: CloseUp, rise_k: np.ndarray | None = None
+    ) -> np.ndarray:
         """Draws part of what the camera sees, from beside given places and always from one height.
 
         Args:
             qpos_kq: Positions, (k, q), metres and radians.
             x_k: Place along the track that is in the middle of each picture, (k,), metres.
             close: Which part.
+            rise_k: By how much the part is moved up in each picture, and the camera with it, (k,), metres;
+                not at all if None.
 
         Returns:
             Pictures, (k, H, W, 3), uint8 RGB.
@@ -169,21 +151,33 @@ class Renderer:
             ValueError, RuntimeError: As ``render``.
         """
         qpos_kq = self._checked(qpos_kq)
+        stage, placing = self._stage, self.robot.camera
         images = np.empty((len(qpos_kq), close.height, close.width, 3), np.uint8)
+        above = placing.height if rise_k is None else 0.0
         window = Window(
-            focal=close.scale * self._distance,
+            focal=close.scale * placing.distance,
             column=close.width / 2,
-            row=close.height - (CAMERA_HEIGHT - close.bottom) * close.scale,
+            row=close.height - (above - close.bottom) * close.scale,
         )
         half = Window(focal=window.focal / 2, column=window.column / 2, row=window.row / 2)
-        for image, qpos, x in zip(images, qpos_kq, x_k, strict=True):
-            limbs_L4, top = self._pose(qpos)
-            camera = Camera(x=float(x), z=CAMERA_HEIGHT, distance=self._distance, fovy=FOVY)
+        heights = np.full(len(qpos_kq), placing.height) if rise_k is None else rise_k
+        for image, qpos, x, z in zip(images, qpos_kq, x_k, heights, strict=True):
+            shape = stage.pose(self._data, qpos)
+            eye = replace(stage.eye(self._data, shape), x=float(x), z=float(z))
             # The floor behind may be soft, at a quarter of the time.
-            behind = backdrop(close.width // 2, close.height // 2, camera, limbs_L4, exact=False, window=half)
+            behind = stage.backdrop(close.width // 2, close.height // 2, eye, half, shape, exact=False)
             cv2.resize(behind, (close.width, close.height), dst=image, interpolation=cv2.INTER_LINEAR)
-            self._draw(image, camera, window, limbs_L4, top, by=_CLOSE_SCALE, exact=False)
+            self._draw(image, eye, window, shape, by=_CLOSE_SCALE, exact=False)
         return images
+
+    def shapes(self, qpos_kq: np.ndarray) -> list[Shape]:
+        """How far the robot's geoms reach at each of some positions, (k, q)."""
+        return [self._stage.pose(self._data, qpos) for qpos in np.asarray(qpos_kq, np.float64)]
+
+    def outline(self, qpos: np.ndarray) -> np.ndarray:
+        """The border of the robot at some positions, (q,): right and above the floor, metres, (n, 2)."""
+        self._stage.pose(self._data, np.asarray(qpos, np.float64))
+        return self._stage.outline(self._data)
 
     def close(self) -> None:
         """Frees the GL context. Closing twice does nothing."""
@@ -214,28 +208,19 @@ class Renderer:
         self._context.make_current()
         return qpos_Tq
 
-    def _pose(self, qpos: np.ndarray) -> tuple[np.ndarray, float]:
-        """Moves the robot; its limbs and its top, as ``_limbs``."""
-        model, data = self._model, self._data
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_camlight(model, data)
-        return _limbs(model, data)
-
     def _draw(
-        self, image: np.ndarray, camera: Camera, window: Window, limbs_L4: np.ndarray, top: float, *,
-        by: float, exact: bool,
-    ) -> None:  # fmt: skip
+        self, image: np.ndarray, eye: Eye, window: Window, shape: Shape, *, by: float, exact: bool
+    ) -> None:
         """Draws the robot, just posed, over what is behind it."""
         height, width = image.shape[:2]
-        self._data.cam_xpos[self._view.fixedcamid] = (camera.x, -camera.distance, camera.z)
+        self._data.cam_xpos[self._view.fixedcamid] = self._stage.place(eye)
+        self._data.cam_xmat[self._view.fixedcamid] = self._stage.turn
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(
             self._model, self._data, self._option, None, self._view, everything, self._scene
         )
         # Reading all of the picture would take longer than drawing the robot, which covers a tenth of it.
-        x0, y0, x1, y1 = _part(limbs_L4, top, camera, window, width, height)
+        x0, y0, x1, y1 = _part(shape, eye, window, width, height)
         if x0 >= x1 or y0 >= y1:
             return
         if not exact:  # one and a half is a whole number for an even one
@@ -264,201 +249,19 @@ class Renderer:
             camera.frustum_width = rect.width / 2 * pixel
 
 
-class Order(IntEnum):
-    """What is drawn first."""
-
-    AWAITED = 0
-    """Somebody looks at an empty frame."""
-    AHEAD = 1
-    """Somebody will."""
-    FILM = 2
-    """A long job, which lets others go first between its pictures (``Renderer.between``)."""
-
-
-class Drawing(Protocol):
-    """Whatever draws: a ``RenderThread``, or a process of its own."""
-
-    def submit(self, job: Callable[[Renderer], T], order: Order = ...) -> Future[T]:
-        """As ``RenderThread.submit``."""
-        ...
-
-
-class RenderThread:
-    """One renderer in a daemon thread of its own, for callers in any thread.
-
-    Args:
-        width: Pixels, even.
-        height: Pixels, even.
-        at_once: Whether to raise if this machine cannot draw; otherwise each job does, until one can.
-        exact: As of ``Renderer``.
-
-    Raises:
-        UserError: If this machine cannot draw without a screen.
-    """
-
-    def __init__(
-        self, width: int = WIDTH, height: int = HEIGHT, *, at_once: bool = True, exact: bool = True
-    ) -> None:
-        self._make = partial(Renderer, width, height, exact=exact)
-        self._jobs: queue.PriorityQueue[_Entry] = queue.PriorityQueue()
-        self._numbers = itertools.count()
-        self._lock = threading.Lock()
-        self._closed = False
-        self._renderer: Renderer | None = None
-        started: Future[None] = Future()
-        self._put(Order.AWAITED, started, lambda _: None)
-        self._thread = threading.Thread(target=self._work, name="render", daemon=True)
-        self._thread.start()
-        try:
-            started.result()
-        except Exception as error:
-            if at_once or not isinstance(error, UserError):
-                self.close()
-                raise
-            log.error("%s", error)
-
-    def submit(self, job: Callable[[Renderer], T], order: Order = Order.AHEAD) -> Future[T]:
-        """Runs ``job(renderer)`` in the render thread; of equal order in the order of submission.
-
-        Args:
-            job: Called with the thread's renderer.
-            order: What it comes before, or after.
-
-        Returns:
-            The future of what ``job`` returns or raises.
-
-        Raises:
-            RuntimeError: If the thread is closed.
-        """
-        future: Future[T] = Future()
-        with self._lock:
-            if self._closed:
-                raise RuntimeError("the render thread is closed")
-            self._put(order, future, job)
-        return future
-
-    def render(self, qpos_Tq: np.ndarray) -> Future[np.ndarray]:
-        """The future of ``Renderer.render(qpos_Tq)``."""
-        return self.submit(lambda renderer: renderer.render(qpos_Tq))
-
-    def close(self) -> None:
-        """Ends the thread after the picture in hand; jobs still waiting are cancelled."""
-        with self._lock:
-            if not self._closed:
-                self._closed = True
-                self._put(_LAST, Future(), lambda _: None)
-        if threading.current_thread() is not self._thread:
-            self._thread.join()
-
-    def __enter__(self) -> RenderThread:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def _put(self, order: int, future: Future[Any], job: Callable[[Renderer], Any]) -> None:
-        self._jobs.put(_Entry(order, next(self._numbers), future, job))
-
-    def _work(self) -> None:
-        give_way(_NICE)  # before the driver starts threads of its own
-        try:
-            while (entry := self._jobs.get()).order < _LAST:
-                self._do(entry)
-        finally:
-            if self._renderer is not None:
-                self._renderer.close()
-
-    def _do(self, entry: _Entry) -> None:
-        if self._closed:
-            entry.future.cancel()
-        if not entry.future.set_running_or_notify_cancel():
-            return
-        try:
-            if self._renderer is None:
-                self._renderer = self._make()
-                self._renderer.between = self._between
-            entry.future.set_result(entry.job(self._renderer))
-        except BaseException as error:
-            entry.future.set_exception(error)
-
-    def _between(self) -> None:
-        """Does what is more urgent than the film in hand; for a second at most, so that it ends some day."""
-        until = time.monotonic() + _PATIENCE_S
-        while not self._closed and time.monotonic() < until:
-            try:
-                entry = self._jobs.get_nowait()
-            except queue.Empty:
-                return
-            if entry.order >= Order.FILM:
-                self._jobs.put(entry)
-                return
-            self._do(entry)
-        if self._closed:
-            raise CancelledError("the render thread is closed")
-
-
-_LAST = max(Order) + 1
-_PATIENCE_S = 1.0
-_NICE = 5
-"""Behind the page, before practice: people wait for pictures."""
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class _Entry:
-    order: int
-    number: int
-    future: Future[Any] = field(compare=False)
-    job: Callable[[Renderer], Any] = field(compare=False)
-
-
-def _studio_model(path: Path, *, width: int, height: int) -> mujoco.MjModel:
-    """The robot alone, in flat strong colours under a soft light; physics is left as it is."""
-    spec = mujoco.MjSpec.from_file(str(path))
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.quality.offsamples = 0
-    spec.visual.quality.numslices = 40
-    spec.visual.headlight.ambient = [0.46] * 3
-    spec.visual.headlight.diffuse = [0.26] * 3
-    spec.visual.headlight.specular = [0.0] * 3
-    spec.camera("track").fovy = FOVY
-    for light in spec.lights:
-        light.dir = [0.35, 0.55, -1.0]
-        light.diffuse, light.ambient, light.specular = [0.5] * 3, [0.0] * 3, [0.22] * 3
-    limb = 0
-    for geom in spec.geoms:
-        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            geom.rgba = [0, 0, 0, 0]  # the floor is drawn by the backdrop
-        else:
-            geom.material = ""
-            geom.rgba = [*LIMB_COLOURS[limb % len(LIMB_COLOURS)], 1]
-            limb += 1
-    return spec.compile()
-
-
-def _limbs(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, float]:
-    """Per capsule (x low, x high, z low, radius), (L, 4), and the top of the whole, metres."""
-    solid = model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE.value
-    radius = model.geom_size[solid, 0]
-    axis = data.geom_xmat[solid].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[solid, 1:2]
-    reach = np.abs(axis) + radius[:, None]
-    low, high = data.geom_xpos[solid] - reach, data.geom_xpos[solid] + reach
-    return np.stack([low[:, 0], high[:, 0], low[:, 2], radius], 1), float(high[:, 2].max())
-
-
-def _part(
-    limbs_L4: np.ndarray, top: float, camera: Camera, window: Window, width: int, height: int
-) -> tuple[int, int, int, int]:
+def _part(shape: Shape, eye: Eye, window: Window, width: int, height: int) -> tuple[int, int, int, int]:
     """What part of the picture can hold the robot: left, bottom, right, top, pixels from below."""
-    lowest, highest = limbs_L4.min(0).tolist(), limbs_L4.max(0).tolist()
+    low, high = shape.low.min(axis=0).tolist(), shape.high.max(axis=0).tolist()
     # Whatever is left of the middle is furthest from it where it is nearest to the camera, or else farthest.
-    scales = (window.focal / (camera.distance - highest[3]), window.focal / camera.distance)
-    x0, x1 = (edge(scale * (x - camera.x) for scale in scales) + window.column
-              for edge, x in ((min, lowest[0]), (max, highest[1])))  # fmt: skip
-    y0, y1 = (edge(scale * (z - camera.z) for scale in scales) + height - window.row
-              for edge, z in ((min, lowest[2]), (max, top)))  # fmt: skip
-    low = [max(0, math.floor(edge) - 1) for edge in (x0, y0)]
-    high = [min(size, math.ceil(edge) + 1) for edge, size in ((x1, width), (y1, height))]
-    return low[0], low[1], high[0], high[1]
+    nearest = max(eye.distance + low[1] - eye.y, 0.1 * eye.distance)
+    scales = (window.focal / nearest, window.focal / max(eye.distance + high[1] - eye.y, nearest))
+    x0, x1 = (edge(scale * (x - eye.x) for scale in scales) + window.column
+              for edge, x in ((min, low[0]), (max, high[0])))  # fmt: skip
+    y0, y1 = (edge(scale * (z - eye.z) for scale in scales) + height - window.row
+              for edge, z in ((min, low[2]), (max, high[2])))  # fmt: skip
+    begin = [max(0, math.floor(edge) - 1) for edge in (x0, y0)]
+    end = [min(size, math.ceil(edge) + 1) for edge, size in ((x1, width), (y1, height))]
+    return begin[0], begin[1], end[0], end[1]
 
 
 def _paste(image: np.ndarray, pixels: np.ndarray) -> None:

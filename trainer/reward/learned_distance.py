@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from onedemo.core import optimisers
 from onedemo.reward.latent_track import track_of
 from onedemo.reward.model import CLASSES, FitStats, PredictorConfig, Snapshot, View, expected
 from onedemo.reward.segment_marks import marked_steps
@@ -239,7 +240,7 @@ def _fit_one(
             basis.shape[1], body_of(robot_named(view.robot)).pose_size, generator=generator
         )
         parameters.append(places.requires_grad_())
-    optimiser = torch.optim.Adam(parameters, _RATE, fused=True)
+    optimiser = optimisers.Adam(parameters, _RATE, fused=True)
     schedule = None
     if view.track is None:  # many more numbers: large steps first, small ones in the end
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 2 * _RATE, total_steps=_UPDATES)

@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from onedemo.core import optimisers
 from onedemo.errors import UserError
 from onedemo.reward.model import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
 from onedemo.reward.segment_marks import split_marks
@@ -217,7 +218,7 @@ def _fit_one(
     classes_n: torch.Tensor, config: PredictorConfig, rate: float, generator: torch.Generator, device: str,
 ) -> float:  # fmt: skip
     """Trains one network; its mean loss over the last tenth of the updates."""
-    optimiser = torch.optim.SGD(
+    optimiser = optimisers.SGD(
         net.parameters(), lr=rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
     )
     counts = torch.bincount(classes_n, minlength=CLASSES)

@@ -13,14 +13,18 @@ import numpy as np
 
 from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, Transitions
 from onedemo.robots.registry import robot_named
-from onedemo.robots.robot import Robot, model_of
+from onedemo.robots.robot import Robot, floor_of, model_of
 from onedemo.sim import vector_env
 from onedemo.sim.kinematics import body_of
 
+_TRIES = 20
+"""Draws of twice as many states as are asked for."""
 _SUNK = 0.05
 """Metres that a part may reach into the ground: contacts push it out within a few steps."""
 _SLIDE_SPEED, _TURN_SPEED = 2.0, 4.0
 """Standard deviations of velocities where the robot does not say, m/s and rad/s."""
+_SLIDE_SECONDS = 0.5
+"""A slide goes from one end to the other in no less, within one deviation."""
 
 
 def random_states(
@@ -37,43 +41,62 @@ def random_states(
         Positions (n, q), where the place on the floor is 0, and velocities (n, v).
     """
     of = robot_named(name)
-    kept = [np.zeros((0, of.positions))]
-    while sum(map(len, kept)) < count:
+    found = [np.zeros((0, of.positions))]
+    for _ in range(_TRIES):
+        if sum(map(len, found)) >= count:
+            break
         qpos = _positions(of, 2 * count, rng)
-        if of.root == "fixed" or of.camera.up != 2:
-            kept.append(qpos)  # there is no ground to reach
-            continue
-        lowest = np.minimum.reduce(list(body_of(of).clearances(qpos).values()))
-        kept.append(qpos[lowest > -_SUNK])
-    qpos = np.concatenate(kept)[:count]
+        found.append(qpos[_sunk(of, qpos) < _SUNK])
+    missing = count - sum(map(len, found))
+    if missing > 0:  # a robot that hardly fits above its floor is lifted, or else left as it is
+        qpos = _positions(of, missing, rng)
+        if of.height is not None:
+            qpos[:, of.height] += np.maximum(0, _sunk(of, qpos))
+        found.append(qpos)
+    qpos = np.concatenate(found)[:count]
     return qpos, rng.normal(0.0, _speeds(of), (count, of.velocities))
+
+
+def _sunk(of: Robot, qpos: np.ndarray) -> np.ndarray:
+    """How deep the lowest part is in the floor, metres, (n,), negative above it; nothing is where none is."""
+    floor = floor_of(model_of(of.xml))
+    if floor is None or of.camera.up != 2:
+        return np.full(len(qpos), -np.inf)
+    return floor - np.minimum.reduce(list(body_of(of).clearances(qpos).values()))
 
 
 def _positions(of: Robot, count: int, rng: np.random.Generator) -> np.ndarray:
     model = model_of(of.xml)
-    qpos = np.tile(model.qpos0, (count, 1))
+    qpos = np.tile(of.rest, (count, 1))
     first = {"planar": 3, "free": 7, "fixed": 0}[of.root]
-    if of.root != "fixed":
-        qpos[:, : of.unseen] = 0
+    qpos[:, of.hidden] = 0
+    if of.height is not None:
         qpos[:, of.height] = rng.uniform(*of.wild.heights, count)
     if of.root == "planar":
         qpos[:, 2] = rng.uniform(-np.pi, np.pi, count)
     elif of.root == "free":
-        turned = rng.standard_normal((count, 4))
-        qpos[:, 3:7] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        qpos[:, 3:7] = _turned(count, rng)
     if of.wild.joints is not None:
         ranges = np.array(of.wild.joints)
         qpos[:, first:] = rng.uniform(ranges[:, 0], ranges[:, 1], (count, len(ranges)))
         return qpos
+    kinds = mujoco.mjtJoint
     for joint in np.flatnonzero(model.jnt_qposadr >= first):
-        at, kind = model.jnt_qposadr[joint], model.jnt_type[joint]
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
-            turned = rng.standard_normal((count, 4))
-            qpos[:, at : at + 4] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        elif kind != mujoco.mjtJoint.mjJNT_FREE:
-            low, high = model.jnt_range[joint] if model.jnt_limited[joint] else (-np.pi, np.pi)
-            qpos[:, at] = rng.uniform(low, high, count)
+        at, kind, limited = model.jnt_qposadr[joint], model.jnt_type[joint], model.jnt_limited[joint]
+        if kind == kinds.mjJNT_BALL:
+            qpos[:, at : at + 4] = _turned(count, rng)
+        elif limited and kind != kinds.mjJNT_FREE:
+            qpos[:, at] = rng.uniform(*model.jnt_range[joint], count)
+        elif kind == kinds.mjJNT_HINGE:
+            qpos[:, at] = rng.uniform(-np.pi, np.pi, count)
+        # What else there is stays where it rests: a thing beside the robot, a slide without an end.
     return qpos
+
+
+def _turned(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Rotations of every kind, quaternions (n, 4)."""
+    turned = rng.standard_normal((count, 4))
+    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def _speeds(of: Robot) -> np.ndarray:
@@ -86,7 +109,8 @@ def _speeds(of: Robot) -> np.ndarray:
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             speeds[at : at + 3] = _SLIDE_SPEED
         elif model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
-            speeds[at] = _SLIDE_SPEED
+            reach = np.ptp(model.jnt_range[joint]) if model.jnt_limited[joint] else np.inf
+            speeds[at] = min(_SLIDE_SPEED, reach / _SLIDE_SECONDS)  # a finger does not race
     return speeds
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from onedemo.robots.robot import CONTACT_MARGIN, GYMNASIUM_ASSETS, Robot, StockReward, Wild, build
+from onedemo.robots.robot import CONTACT_MARGIN, GYMNASIUM_ASSETS, Camera, Robot, StockReward, Wild, build
 
 # hopper.xml: length of each part along its own axis from joint to joint, metres.
 _HALF_TORSO, _THIGH, _LEG = 0.2, 0.45, 0.5
@@ -20,6 +20,7 @@ def make() -> Robot:
     """The robot."""
     return build(
         "hopper", GYMNASIUM_ASSETS / "hopper.xml", frame_skip=4, velocity_limit=10.0, feet=("foot",),
+        camera=Camera(distance=3.0, height=0.88),
         # Joint ranges of the model, whose stops are soft.
         wild=Wild(
             heights=(0.05, 1.9), joints=((-2.6, 0.05), (-2.6, 0.05), (-0.78, 0.78)),

@@ -79,7 +79,8 @@ class Body:
         """Change of the pose per ``MOTION_SCALE`` seconds, limited: (..., o) to (..., P)."""
         qpos, qvel = self.robot.state(obs)
         if self.planar:
-            return self.motion_of(qvel[..., 1], self.directions(obs), qvel @ self._turns.T)
+            climb = np.zeros(obs.shape[:-1]) if self.robot.height is None else qvel[..., self.robot.height]
+            return self.motion_of(climb, self.directions(obs), qvel @ self._turns.T)
         placed = self._place(qpos)
         spins, speeds = self._move(qvel, placed)
         rates = [np.cross(spins[body], placed.rotations[body] @ axis) for body, axis in self._axes]
@@ -89,9 +90,9 @@ class Body:
     def travel(self, obs: np.ndarray) -> np.ndarray:
         """How fast the root moves to the right in pictures, m/s: (..., o) to (...)."""
         _, qvel = self.robot.state(obs)
-        if self.robot.root == "fixed":
+        if self.robot.across is None:
             return np.zeros(obs.shape[:-1])
-        return qvel[..., self._right if self.robot.root == "free" else 0]
+        return qvel[..., self.robot.across]
 
     def pose_of(self, height: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """A planar robot's pose of a height (...), metres, and directions (..., L), radians: (..., P)."""
@@ -150,9 +151,10 @@ class Body:
     # Inside
 
     def _height(self, qpos: np.ndarray) -> np.ndarray:
-        if self.robot.unseen > 1:  # the camera follows it up, too
+        at = self.robot.height
+        if at is None:  # the camera follows it up, too
             return np.zeros(qpos.shape[:-1])
-        return qpos[..., 1] - self._rest[1] + self._model.body_pos[self._limbs[0]][self._up]
+        return qpos[..., at] - self._rest[at] + self._model.body_pos[self._limbs[0]][self._up]
 
     def _at(self, placed: _Placed, body: int, point: np.ndarray) -> np.ndarray:
         """Where a point of a body is in the world, (..., 3)."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from onedemo.core.names import LONGEST, check_name
 
-CLIP_FORMAT = 2
+CLIP_FORMAT = 3
 """How clips are drawn: raised when another page must show them. Those of before are drawn again under another
 name when somebody looks, and deleted as the oldest."""
 

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from onedemo.core.files import jpeg_fault, read_whole, write_atomic
-from onedemo.render.renderer import Order
+from onedemo.render.render_thread import Order
 from onedemo.reward.episode_rules import mean_rating
 from onedemo.rl.rollouts import Transitions
 from onedemo.training.pictures import Job, PictureFiles, draw_film, draw_strip

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from onedemo.core.files import jpeg_fault, read_whole
 from onedemo.errors import DatabaseLost, in_words
-from onedemo.render.renderer import Order
+from onedemo.render.render_thread import Order
 from onedemo.storage.store import Store
 from onedemo.training.pictures import PictureFiles
 from onedemo.types import Clip

@@ -16,7 +16,7 @@ import numpy as np
 
 from onedemo.core.files import jpeg_fault, read_whole
 from onedemo.queries.selection import choose
-from onedemo.render.renderer import Order
+from onedemo.render.render_thread import Order
 from onedemo.storage.comparisons import NewPair, Pair
 from onedemo.storage.store import Store
 from onedemo.training.clip_worker import Notes

@@ -207,7 +207,8 @@ class Learner:
         """One iteration: rollouts, all scored by this one snapshot, and a TRPO step.
 
         Returns:
-            The rollouts, and figures: ``predicted`` (mean rating, 1..5) and those of ``TrpoStats``.
+            The rollouts, and figures: ``predicted`` (mean rating, 1..5), those of ``TrpoStats``, and
+            ``unstable``, the episodes that ended because the physics became unstable, if any did.
         """
         began = time.perf_counter()
         sizes = self.config.rollouts
@@ -215,14 +216,17 @@ class Learner:
         steps = max(1, min(sizes.steps, left))
         policy = self._policy.snapshot(on_device=self._acts_on_device)
         self._use(snapshot)
+        lost = self._collector.env.unstable
         rollouts = self._collector.collect(policy, steps)
+        lost = self._collector.env.unstable - lost
         predicted = mean_rating(rollouts.rewards.ravel(), (rollouts.next_clock - rollouts.clock).ravel())
         collected = time.perf_counter()
         stats = self._trpo.update(rollouts, progress=min(1.0, self.env_steps / sizes.total_steps))
         self.seconds = {"rollouts": collected - began, "policy": time.perf_counter() - collected}
         self.iteration += 1
         self.env_steps += rollouts.clock.size
-        return rollouts, {"predicted": float(predicted), **asdict(stats)}
+        figures = {"predicted": float(predicted), **asdict(stats)}
+        return rollouts, figures | ({"unstable": lost} if lost else {})
 
     def forecast(self, snapshot: Snapshot, ratings: Sequence[RatedSegment]) -> dict[str, float]:
         """How right a snapshot is about ratings that it was not fitted on; draws nothing at random.

@@ -27,7 +27,9 @@ from onedemo.demos.video import write_webm
 from onedemo.render.clip_image import compose_clip, side_by_side
 from onedemo.render.framing import clip_sides
 from onedemo.render.mover import Mover, locate
-from onedemo.render.renderer import Drawing, Order, Renderer
+from onedemo.render.render_thread import Drawing, Order
+from onedemo.render.renderer import Renderer
+from onedemo.robots.robot import Robot
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
 from onedemo.types import Demo, Segment
@@ -50,14 +52,14 @@ class PictureFiles:
     Args:
         drawing: Draws; not closed here.
         demo: What the robot is shown beside.
-        dt: Seconds of a control step.
+        robot: The robot.
     """
 
-    def __init__(self, drawing: Drawing, demo: Demo, dt: float) -> None:
-        self.demo, self.dt = demo, dt
-        self._drawing = drawing
-        steps = int(demo.frames / demo.fps / dt + 1e-6)
-        self._frame = frame_of_step(np.arange(steps), dt, demo.fps, demo.frames)
+    def __init__(self, drawing: Drawing, demo: Demo, robot: Robot) -> None:
+        self.demo, self.dt = demo, robot.dt
+        self._drawing, self._robot = drawing, robot
+        steps = int(demo.frames / demo.fps / robot.dt + 1e-6)
+        self._frame = frame_of_step(np.arange(steps), robot.dt, demo.fps, demo.frames)
         self._lock = threading.Lock()
         self._coming: dict[Path, Future[Path]] = {}
         self._asked: dict[Path, float] = {}
@@ -82,7 +84,7 @@ class PictureFiles:
             if file.is_file():
                 future.set_result(file)
                 return future
-            drawn = self._drawing.submit(job(), order)
+            drawn = self._drawing.submit(job(), order, self._robot)
             self._coming[file] = future
 
         def tell(drawn: Future[None]) -> None:
@@ -137,7 +139,7 @@ def draw_clip(
 
     It is not synced: after a power cut its checksum tells that it must be drawn again.
     """
-    film, mover = _filmed(demo)
+    film, mover = _filmed(demo, renderer.robot)
     sides = clip_sides(renderer, film[frames], mover and mover.at(frames), robots)
     write_atomic(file, sealed(compose_clip(*sides)), sync=False)
 
@@ -173,12 +175,13 @@ def draw_film(
     """
     shown = np.round(np.arange(0, len(qpos) * dt * demo.fps) / demo.fps / dt).astype(int)
     shown = shown[shown < len(qpos)]
+    film, _ = _filmed(demo, renderer.robot)
 
     def pairs() -> Iterator[np.ndarray]:
         for some in np.array_split(shown, -(-len(shown) // _AT_ONCE)):
             renderer.between()
             for t, robot in zip(some, renderer.render(qpos[some]), strict=True):
-                yield side_by_side(_filmed(demo)[0][frames[t]], robot)
+                yield side_by_side(film[frames[t]], robot)
 
     with replacing(file, ".webm", sync=False) as half:
         write_webm(
@@ -202,10 +205,10 @@ def captioned(picture: np.ndarray, left: str, right: str) -> np.ndarray:
 
 
 @lru_cache(1)
-def _filmed(demo: Demo) -> tuple[np.ndarray, Mover | None]:
+def _filmed(demo: Demo, robot: Robot) -> tuple[np.ndarray, Mover | None]:
     """The demo's pictures, (F, H, W, 3), uint8 RGB, and what moves in them: once, not for each clip."""
     frames = np.stack(list(stream_frames(demo)))
-    return frames, locate(frames)
+    return frames, locate(frames, robot)
 
 
 # What is deleted

@@ -49,7 +49,7 @@ def find_run(
         wanted: Settings that were asked for; None takes those the run was made with.
 
     Raises:
-        UserError: If the run has other settings or was made with another video.
+        UserError: If the run has other settings, or was made with another video or model of the robot.
     """
     runs = store.runs.all()
     found = [r for r in runs if (r["id"] == name if name else r["demo"] == demo.name)]
@@ -67,8 +67,15 @@ def find_run(
     if not file.exists():  # lost with the directory; the database has it too
         write_atomic(file, run["config"].encode())
     config = load_config(file, _of_before(file))
+    if config.env_sha256 not in ("", robot_named(config.env).sha256):
+        raise UserError(
+            f"run {run['id']!r} was made with another model of robot {config.env} than there is now; bring "
+            "back the one that it was made with, or start a new run with --new-run"
+        )
+    config = replace(config, env_sha256="")  # has said what it had to
     if wanted is not None:  # where it computes, and what it leaves on the disk, is no part of what a run is
         config = replace(config, device=wanted.device, storage=wanted.storage)
+        wanted = replace(wanted, env_sha256="")
     if wanted is not None and wanted != config:
         raise UserError(
             f"run {run['id']!r} has other settings than those given: {_differences(config, wanted)} "
@@ -107,6 +114,15 @@ def _leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def check_robot(demo: Demo, robot: str) -> None:
+    """Raises UserError if the demo is of another robot than the one that would learn from it, by name."""
+    if demo.robot and demo.robot != robot:
+        raise UserError(
+            f"demonstration {demo.name!r} shows robot {demo.robot!r}, but this run's robot is {robot!r}: "
+            f"choose a demonstration of {robot!r}, or robot {demo.robot!r}"
+        )
+
+
 def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name: str | None) -> str:
     """Records a new run and writes its settings; returns its name.
 
@@ -118,16 +134,23 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         name: What to call it, or None: ``<demo>-<number>``.
 
     Raises:
-        UserError: If the demo is shorter than a clip, the robot is unknown, or the name is taken or
-            cannot be the name of a directory.
+        UserError: If the demo is shorter than a clip or of another robot, the robot is unknown, or the name
+            is taken or cannot be the name of a directory.
     """
+    robot = robot_named(config.env)
+    check_robot(demo, robot.name)
+    if config.env_sha256 not in ("", robot.sha256):
+        raise UserError(
+            f"these settings are of a run with another model of robot {config.env} than there is now; leave "
+            "env_sha256 out to use the one there is"
+        )
     lengths(config, demo.frames, demo.fps)
     if name is not None:
         check_new_name(check_name(name))
     else:
         taken = {r["id"] for r in store.runs.all()}
         name = next(n for k in count(1) if (n := f"{demo.name}-{k}") not in taken)
-    text = to_toml(config)
+    text = to_toml(replace(config, env_sha256=robot.sha256))
     store.runs.add(
         run=name,
         demo=demo.name,
@@ -135,7 +158,7 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
         seed=config.seed,
         config=text,
         version=program_version(),
-        step_seconds=robot_named(config.env).dt,
+        step_seconds=robot.dt,
     )
     write_atomic(RunDirectory(data_dir, name).config, text.encode())
     return name

@@ -94,6 +94,7 @@ def train(
         "env_steps": learner.env_steps,
         "steps_per_s": round(learner.env_steps / practised, 1),
         "wall_s": round(time.monotonic() - began, 2),
+        **({"unstable_episodes": training.unstable} if training.unstable else {}),
         "seed": config.seed,
         "deterministic": not (why := chance(config, rater)),
         "not_deterministic_because": why,

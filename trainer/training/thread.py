@@ -51,6 +51,7 @@ class Trainer:
         self._training = training
         self.store, self.run, self.demo = training.store, training.run, training.demo
         self.config, self.data_dir, self.dt = training.config, training.data_dir, training.dt
+        self.robot = training.robot
         self.directory = training.files.path
         self.acting = training.acting
         self.want_pairs = training.want_pairs
@@ -156,6 +157,7 @@ class Trainer:
             env_steps=training.env_steps,
             total_steps=config.rollouts.total_steps,
             steps_per_s=training.steps_per_s,
+            unstable=training.unstable,
             snapshot=snapshot.number if snapshot is not None else 0,
             ratings=training.queue.given(),
             pretrain_ratings=config.ratings.pretrain,

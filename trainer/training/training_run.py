@@ -22,7 +22,7 @@ import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
-from onedemo.render.renderer import Drawing
+from onedemo.render.render_thread import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
 from onedemo.reward.warm_start import keep_start
@@ -102,7 +102,9 @@ class TrainingRun:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
         self.files = RunDirectory(data_dir, run)
-        self.dt = robot_named(config.env).dt
+        self.robot = robot_named(config.env)
+        """What learns."""
+        self.dt = self.robot.dt
         """Seconds of a control step."""
         self.queue = RatingQueue(store, run, config, simulated)
         """The clips that are put to annotators."""
@@ -114,6 +116,8 @@ class TrainingRun:
         """Of the last iteration that is in the database."""
         self.steps_per_s = 0.0
         """Control steps per second in the last iteration."""
+        self.unstable = 0
+        """Episodes that ended because the robot's physics became unstable."""
         self.preparing = "The run is being opened."
         """What comes before the first ``step``: what is done of it now, one sentence."""
         self.track: Track | None = None
@@ -123,7 +127,7 @@ class TrainingRun:
         self._cache_dir, self._watch, self._start = cache_dir or data_dir, watch, start
         self._drawn: _Drawn | None = None
         if renderer is not None:
-            pictures = PictureFiles(renderer, demo, self.dt)
+            pictures = PictureFiles(renderer, demo, self.robot)
             self.queue.clips = ClipMaker(store, file=self.files.clip, pictures=pictures)
             self._drawn = _Drawn(
                 pictures,
@@ -162,6 +166,7 @@ class TrainingRun:
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
         self.learner, self.iteration, self.env_steps = learner, learner.iteration, learner.env_steps
+        self.unstable = sum(row.get("unstable", 0) for row in self.store.runs.iterations(self.run))
         self._load_snapshot()
         if self._drawn is not None:
             self._drawn.clips.recover(self.run)
@@ -297,6 +302,7 @@ class TrainingRun:
         self.queue.withdraw_stale(learner.iteration)
         self.iteration, self.env_steps = learner.iteration, learner.env_steps
         self.steps_per_s = stats["steps_per_s"]
+        self.unstable += stats.get("unstable", 0)
         if self._watch is not None:
             self._watch(learner, snapshot)
 

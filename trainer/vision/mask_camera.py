@@ -50,9 +50,11 @@ class Motion:
         """Whether the camera does, for pictures of H rows and W columns, as far as it is known."""
         rows, columns = size
         moves = []
+        even = np.ones((9, 1)) / 9  # grain shakes single moves, a camera that goes goes on
         for x, y in ((0.1, 0.5), (0.5, 0.9), (0.9, 0.5), (0.5, 0.1), (0.5, 0.5)):
             place = np.tile([x * columns, y * rows], (len(self.maps) + 1, 1))
-            moves.append(np.abs(self.shifts(place)[self.told > 0]))
+            shifts = cv2.filter2D(self.shifts(place), -1, even, borderType=cv2.BORDER_REPLICATE)
+            moves.append(np.abs(shifts[self.told > 0]))
         return not self.known or float(np.median(moves, axis=1).max()) < _STANDS
 
 
@@ -63,28 +65,48 @@ def follow_background(greys: np.ndarray, movers: np.ndarray | None = None) -> Mo
         greys: (F, H, W), uint8.
         movers: What moves by itself, and is not looked at, (F, H, W), bool; None: not known yet.
     """
-    count, _, width = greys.shape
+    count, height, width = greys.shape
     maps = np.tile(np.eye(2, 3), (max(count - 1, 0), 1, 1))
     told = np.zeros(max(count - 1, 0))
+    greys = np.stack([cv2.GaussianBlur(grey, (0, 0), 0.7) for grey in greys])  # grain has corners, too
     grow = np.ones((max(3, width // 24),) * 2, np.uint8)
     for index in range(count - 1):
         clear = None
         if movers is not None:
             clear = 255 - 255 * cv2.dilate(movers[index].astype(np.uint8), grow)
-        move, share = _map(greys[index], greys[index + 1], clear)
+        likely = maps[index - 1] if index and told[index - 1] else np.eye(2, 3)
+        move, share = _map(greys[index], greys[index + 1], clear, likely)
         if move is not None:
             maps[index], told[index] = move, share
+    told[_odd(maps, told > 0, (height, width))] = 0
     return Motion(maps=_bridged(maps, told > 0), told=told)
 
 
-def _map(here: np.ndarray, there: np.ndarray, clear: np.ndarray | None) -> tuple[np.ndarray | None, float]:
+def _odd(maps: np.ndarray, known: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Which maps are far from those around them, (F - 1,): a pattern that repeats can be followed wrongly."""
+    height, width = size
+    places = np.array([[0.25, 0.6, 1], [0.75, 0.6, 1], [0.5, 0.95, 1], [0.5, 0.3, 1]]) * (width, height, 1)
+    moves = (places @ maps.transpose(0, 2, 1) - places[:, :2]).reshape(len(maps), -1)
+    odd = np.zeros(len(maps), bool)
+    for index in np.flatnonzero(known):
+        around = [k for k in range(max(0, index - 5), min(len(maps), index + 6)) if known[k]]
+        middle = np.median(moves[around], axis=0)
+        spread = np.median(np.abs(moves[around] - middle), axis=0)
+        odd[index] = (np.abs(moves[index] - middle) > 5 * spread + 0.02 * width).any()
+    return odd
+
+
+def _map(
+    here: np.ndarray, there: np.ndarray, clear: np.ndarray | None, likely: np.ndarray
+) -> tuple[np.ndarray | None, float]:
     height, width = here.shape
     corners = cv2.goodFeaturesToTrack(here, _CORNERS, 0.01, max(4, width / 40), mask=clear, blockSize=5)
     if corners is None or len(corners) < _FEWEST:
         return None, 0.0
-    window = {"winSize": (15, 15), "maxLevel": 3}
-    after, seen, _ = cv2.calcOpticalFlowPyrLK(here, there, corners, None, **window)  # type: ignore[call-overload]
-    back, again, _ = cv2.calcOpticalFlowPyrLK(there, here, after, None, **window)  # type: ignore[call-overload]
+    window = {"winSize": (15, 15), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    guess = cv2.transform(corners, likely).astype(np.float32)
+    after, seen, _ = cv2.calcOpticalFlowPyrLK(here, there, corners, guess, **window)  # type: ignore[call-overload]
+    back, again, _ = cv2.calcOpticalFlowPyrLK(there, here, after, corners.copy(), **window)  # type: ignore[call-overload]
     sure = (seen & again).ravel() > 0
     sure &= np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < _ROUND_TRIP
     before, after = corners.reshape(-1, 2)[sure], after.reshape(-1, 2)[sure]

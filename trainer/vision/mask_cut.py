@@ -15,7 +15,11 @@ from onedemo.vision.mask_hints import Box, Click
 
 _BINS = 16
 """Of each colour, in the table of the mover's colours."""
-_SURE, _SOME = 190, 75
+STILL, FOLLOWING = 5.0, 1.5
+"""How much motion counts beside colour: before a background that goes by, much else differs."""
+_CAUTION = 1.0
+"""Odds that it takes more before a background that goes by."""
+_SURE, _SOME = 190, 120
 """Evidence that is the mover, and that may be."""
 _LEAST = 0.0012
 """Share of a picture that a mover covers at least."""
@@ -50,7 +54,7 @@ class Colours:
                 sides = padded.take(range(_BINS), axis) + padded.take(range(2, _BINS + 2), axis)
                 table = 0.6 * table + 0.2 * sides
             tables.append((table / max(table.sum(), 1e-9)).ravel())
-        floor = 0.05 / _BINS**3
+        floor = 0.0015  # a colour seen in a few places says little
         self._ratio = np.log((tables[0] + floor) / (tables[1] + floor)).astype(np.float32)
         self.apart = float(0.5 * np.abs(tables[0] - tables[1]).sum())
         """Share of the mover's colours that are not those of what is behind it, 0..1."""
@@ -68,43 +72,60 @@ def _cells(frame: np.ndarray) -> np.ndarray:
     return (light * _BINS + a) * _BINS + b
 
 
-def seeds_of(evidence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is surely of the mover, and what surely is not, by the evidence alone, (F, H, W) each, bool."""
+def seeds_of(evidence: np.ndarray, *, follows: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What is surely of the mover, and what surely is not, by the evidence alone, (F, H, W) each, bool.
+
+    Args:
+        evidence: (F, H, W).
+        follows: Whether the camera does, and so keeps the mover in about one place.
+    """
     inside = np.zeros(evidence.shape, bool)
     outside = np.zeros(evidence.shape, bool)
+    middle = _middle(evidence.shape[1:]) if follows else None
     for index, shown in enumerate(evidence):
         solid = cv2.morphologyEx((shown > _SURE).astype(np.uint8), cv2.MORPH_OPEN, _ROUND)
-        inside[index] = largest(solid)
+        inside[index] = largest(solid, middle)
         near = cv2.dilate((shown > _SOME).astype(np.uint8), np.ones((5, 5), np.uint8))
         outside[index] = near == 0
     sizes = inside.mean(axis=(1, 2))
     usual = np.median(sizes[sizes > 0]) if (sizes > 0).any() else 0.0
-    odd = (sizes > 3 * usual) | (sizes < 0.3 * usual)
-    inside[odd] = 0
+    inside[(sizes > 3 * usual) | (sizes < 0.3 * usual)] = False
+    if follows:
+        centres = np.array(
+            [np.argwhere(each).mean(axis=0) if each.any() else (np.nan,) * 2 for each in inside]
+        )
+        away = np.abs(centres - np.nanmedian(centres, axis=0)) if inside.any() else centres
+        inside[(away > 0.2 * inside.shape[2]).any(axis=1)] = False
     return inside, outside
 
 
-def largest(solid: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+def _middle(size: tuple[int, ...]) -> np.ndarray:
+    """How much a place counts that a camera follows, (H, W): most in the middle."""
+    height, width = size
+    across, down = (np.exp(-((np.linspace(-1, 1, side) / 0.45) ** 2)) for side in (width, height))
+    return np.outer(down, across).astype(np.float32)
+
+
+def largest(solid: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The largest part of (H, W) uint8, with others that are nearly joined to it; bool.
 
     Args:
         solid: 0 or 1.
-        near: Where it was in the neighbouring picture: parts over it count more.
+        weight: How much each place counts, (H, W); None: all the same.
     """
     joined = cv2.dilate(solid, _ROUND, iterations=2)
     count, labels = cv2.connectedComponents(joined)
     if count < 2:
         return np.zeros(solid.shape, bool)
-    sizes = np.bincount(labels[solid > 0], minlength=count).astype(float)
-    if near is not None:
-        sizes += 3 * np.bincount(labels[(solid > 0) & near], minlength=count)
+    weights = None if weight is None else weight[solid > 0]
+    sizes = np.bincount(labels[solid > 0], weights, minlength=count).astype(float)
     sizes[0] = 0
     return (labels == sizes.argmax()) & (solid > 0)
 
 
 def cut(
     frames: np.ndarray, evidence: np.ndarray | None, colours: Colours, start: int,
-    seeds: Mapping[int, np.ndarray] | None = None,
+    moves: float = STILL, seeds: Mapping[int, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Cuts the mover out, from one picture on to both ends.
 
@@ -113,6 +134,7 @@ def cut(
         evidence: Of motion, (F, H, W); None where there is none.
         colours: Of the mover.
         start: The picture that is surest.
+        moves: How much the evidence counts.
         seeds: The mover in some pictures, (H, W), bool, as somebody has marked it.
 
     Returns:
@@ -128,33 +150,35 @@ def cut(
             if index in seeds:
                 masks[index] = seeds[index]
             else:
-                masks[index], others[index] = _cut_one(frames[index], shown, colours, near)
+                masks[index], others[index] = _cut_one(frames[index], shown, colours, near, moves)
             if masks[index].any():
                 near = masks[index]
     return masks, others
 
 
 def _cut_one(
-    frame: np.ndarray, shown: np.ndarray | None, colours: Colours, near: np.ndarray | None
+    frame: np.ndarray, shown: np.ndarray | None, colours: Colours, near: np.ndarray | None, moves: float
 ) -> tuple[np.ndarray, float]:
     height, width = frame.shape[:2]
     odds = 0.7 * np.clip(colours.odds(frame), -5, 5)
     if shown is not None:
-        odds = odds + 5 * (shown / np.float32(255) - 0.45)
+        odds = odds + moves * (shown / np.float32(255) - 0.45)
     if near is not None:
         reach = max(3, round(0.35 * np.sqrt(near.sum())))
         away = cv2.distanceTransform((~near).astype(np.uint8), cv2.DIST_L2, 3)
-        odds = odds + np.clip(1 - away / reach, -4, 1)
+        odds = odds + np.clip(0.5 - away / reach, -4, 0.5)
     odds = cv2.GaussianBlur(odds.astype(np.float32), (0, 0), 0.8)
-    solid = cv2.morphologyEx((odds > 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    mover = largest(solid, near)
+    if moves < STILL:
+        odds -= _CAUTION
+    solid = cv2.medianBlur((odds > 0).astype(np.uint8), 3)
+    mover = largest(solid, None if near is None else 1 + 3 * near.astype(np.float32))
     area = int(mover.sum())
     if not _LEAST * height * width <= area:
         return np.zeros((height, width), bool), 1.0
     rest = solid.astype(bool) & ~mover
     other = largest(rest.astype(np.uint8)).sum() if rest.any() else 0
-    mover = _sharpened(frame, mover, odds)
-    return mover, float(other / area)
+    # Edges of a background that goes by are no help; where it stands still they are known to be its own.
+    return _sharpened(frame, mover, odds) if moves == STILL else mover, float(other / area)
 
 
 def _sharpened(frame: np.ndarray, mover: np.ndarray, odds: np.ndarray) -> np.ndarray:

@@ -18,8 +18,18 @@ _LOOKED_AT = 64
 _NEIGHBOURS = 10
 _REACH = 30
 """Pictures before and after from which neighbours are taken, at most."""
+_NEAR = 0.85
+"""Share of the height at which the floor goes by the mover, about."""
 _FAR = 0.4
 """Share of the width by which the background has gone by between neighbours, at most."""
+_BESIDE = 0.03
+"""Share of the width by which the background must have gone by, to show what is behind the mover."""
+_OFF = 2
+"""Pixels by which a background that was brought to its place may lie beside it."""
+_BUSY = 50
+"""Difference of colours within that distance from which on nothing can be seen before it."""
+UNKNOWN = 115
+"""Evidence that says nothing."""
 _LOW, _HIGH = 9.0, 34.0
 """Differences of a colour that are surely noise, or surely not, of 255, where the noise is unknown."""
 
@@ -40,33 +50,53 @@ def before_still(frames: np.ndarray) -> np.ndarray:
     return np.stack([_difference(frame, background, noise) for frame in frames])
 
 
-def before_moving(frames: np.ndarray, motion: Motion, rows: np.ndarray) -> np.ndarray:
+def before_moving(frames: np.ndarray, motion: Motion) -> np.ndarray:
     """Evidence of a mover that a camera follows; as ``before_still``.
 
     Args:
         frames: (F, H, W, 3), uint8 RGB.
         motion: Of the camera.
-        rows: Where the mover stands in each picture, (F,): the floor there goes by.
     """
     height, width = frames.shape[1:3]
-    place = np.stack([np.full(len(frames), width / 2), rows], axis=1)
+    place = np.tile([width / 2, _NEAR * height], (len(frames), 1))
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(motion.shifts(place), axis=1))])
     evidence = np.empty(frames.shape[:3], np.uint8)
+    rows = np.stack([np.full(height, width / 2), np.arange(height), np.ones(height)], axis=1)
     for index, frame in enumerate(frames):
-        stack = []
+        stack, aside = [], []
         for other in _neighbours(index, gone, _FAR * width):
             move = joined(motion.maps, other, index)
+            aside.append(np.linalg.norm(rows @ move.T - rows[:, :2], axis=1))
             how = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
             stack.append(cv2.warpAffine(frames[other], move, (width, height), **how))
         if not stack:
-            evidence[index] = 0
+            evidence[index] = UNKNOWN
             continue
-        around = np.stack(stack)
-        background = np.median(around, axis=0).astype(np.uint8)
-        # Texture that the map does not bring to its place differs among the neighbours, too.
-        noise = np.median([cv2.absdiff(each, background).max(axis=2) for each in around], axis=0)
-        evidence[index] = _difference(frame, background, cv2.blur(noise.astype(np.float32), (3, 3)))
+        background = _middle(np.stack(stack))
+        shown, busy = _beyond(frame, background)
+        shown[busy] = np.maximum(shown[busy], UNKNOWN)
+        still = np.clip(2 - np.median(aside, axis=0) / (_BESIDE * width), 0, 1) * UNKNOWN
+        evidence[index] = np.maximum(shown, still.astype(np.uint8)[:, None])
     return evidence
+
+
+def _middle(stack: np.ndarray) -> np.ndarray:
+    """The median of some pictures, (n, ...), uint8."""
+    middle = len(stack) // 2
+    return np.partition(stack, middle, axis=0)[middle]
+
+
+def _beyond(frame: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Evidence of one picture before a background that may be a little off its place.
+
+    Returns:
+        The evidence, (H, W), and where the background's texture is so fine that it says nothing, (H, W).
+    """
+    around = np.ones((2 * _OFF + 1,) * 2, np.uint8)
+    low, high = cv2.erode(background, around), cv2.dilate(background, around)
+    other = cv2.max(cv2.subtract(frame, high), cv2.subtract(low, frame)).max(axis=2).astype(np.float32)
+    shown = (255 * np.clip((other - _LOW) / (_HIGH - _LOW), 0, 1)).astype(np.uint8)
+    return shown, cv2.subtract(high, low).max(axis=2) > _BUSY
 
 
 def _neighbours(index: int, gone: np.ndarray, far: float) -> list[int]:

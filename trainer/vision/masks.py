@@ -18,9 +18,11 @@ import cv2
 import numpy as np
 
 from onedemo.render.mover import is_studio, solid_in_studio, way_in_studio
-from onedemo.render.renderer import CAMERA_HEIGHT, FREE_ABOVE, studio
+from onedemo.render.renderer import studio
+from onedemo.render.stage import free_above
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.vision.mask_camera import Motion, follow_background
-from onedemo.vision.mask_cut import Colours, boxed, clicked, cut, seeds_of
+from onedemo.vision.mask_cut import FOLLOWING, STILL, Colours, boxed, clicked, cut, seeds_of
 from onedemo.vision.mask_evidence import before_moving, before_still
 from onedemo.vision.mask_hints import Hints
 
@@ -30,6 +32,10 @@ SURE = 0.5
 """Doubt below which a mask is taken to be right."""
 _LONGEST = 95
 """Percentile of the masks' diagonals that is the mover stretched out."""
+_TOUCHES = 45
+"""Pictures within which a mover comes down, if it ever does."""
+_OWN = 1.0
+"""Logarithm of the odds from which on a colour is the mover's own."""
 _CHANGED = 0.15
 """Share of the picture that may differ from the median picture where the camera stands."""
 _AROUND = 2
@@ -112,12 +118,12 @@ def find_masks(
     if still:
         evidence = before_still(frames)
     elif motion.known:
-        evidence = before_moving(frames, motion, np.full(len(frames), 0.85 * frames.shape[1]))
+        evidence = before_moving(frames, motion)
     check(0.5)
     method = "still" if still else "following" if evidence is not None else "colour"
-    found = None if evidence is None else _by_evidence(frames, evidence)
+    found = None if evidence is None else _by_evidence(frames, evidence, follows=not still)
     if hints:
-        method, found = "chosen", _marked(frames, evidence, hints, found)
+        method, found = "chosen", _marked(frames, evidence, STILL if still else FOLLOWING, hints, found)
     elif found is None:
         method, found = "colour", _by_colour(frames)
     if found is None:
@@ -154,11 +160,12 @@ def boxes_of(masks: np.ndarray) -> np.ndarray:
 
 def _in_studio(frames: np.ndarray) -> Masks:
     height, width = frames.shape[1:3]
-    view = studio(width, height)
+    camera = robot_named(DEFAULT).camera
+    view = studio(width, height, camera)
     solids = np.stack([solid_in_studio(frame) for frame in frames])
     masks = solids.astype(bool)
     floor = np.full(len(frames), height + view.bottom * view.scale)
-    top = height - (CAMERA_HEIGHT + FREE_ABOVE - 0.03 - view.bottom) * view.scale
+    top = height - (camera.height + free_above(camera) - 0.03 - view.bottom) * view.scale
     floor[boxes_of(masks)[:, 1] < top] = np.nan  # the camera rises with the robot
     return Masks(
         masks=masks, floor=floor, scale=view.scale, way=way_in_studio(frames, solids),
@@ -176,14 +183,30 @@ def _stands(frames: np.ndarray, motion: Motion) -> bool:
     return motion.known or float(np.mean(changed)) < _CHANGED
 
 
-def _by_evidence(frames: np.ndarray, evidence: np.ndarray) -> _Found | None:
-    inside, outside = seeds_of(evidence)
+def _by_evidence(frames: np.ndarray, evidence: np.ndarray, *, follows: bool) -> _Found | None:
+    inside, outside = seeds_of(evidence, follows=follows)
     if (inside.any(axis=(1, 2))).sum() < max(2, len(frames) // 20):
         return None
-    colours = Colours(frames, inside, outside, _share(inside))
-    start = int(np.argmax(inside.sum(axis=(1, 2))))
-    masks, others = cut(frames, evidence, colours, start)
+    share = _share(inside)
+    colours = Colours(frames, inside, outside, share)
+    own = np.stack([colours.odds(frame) > _OWN for frame in frames]) & inside
+    if own.sum() > 0.3 * inside.sum():  # what else moved there, or seemed to, is left out
+        inside, colours = own, Colours(frames, own, outside | (inside & ~own), share)
+    start = _surest(frames, inside, colours)
+    masks, others = cut(frames, evidence, colours, start, FOLLOWING if follows else STILL)
     return masks, others, colours.apart
+
+
+def _surest(frames: np.ndarray, inside: np.ndarray, colours: Colours) -> int:
+    """The picture in which most of what is taken for the mover has its colours, and least has not."""
+    odds = [colours.odds(frame)[mask] for frame, mask in zip(frames, inside, strict=True)]
+    return int(np.argmax([np.clip(each, -3, 3).sum() for each in odds]))
+
+
+def _grown(masks: np.ndarray) -> np.ndarray:
+    """Masks with what is close around them, (F, H, W), bool."""
+    kernel = np.ones((7, 7), np.uint8)
+    return np.stack([cv2.dilate(mask.astype(np.uint8), kernel) for mask in masks]).astype(bool)
 
 
 def _share(inside: np.ndarray) -> np.ndarray | None:
@@ -207,32 +230,31 @@ def _by_colour(frames: np.ndarray) -> _Found:
     masks = np.zeros(frames.shape[:3], bool)
     for _ in range(3):
         colours = Colours(frames, inside, outside)
-        masks, others = cut(frames, None, colours, len(frames) // 2)
+        masks, others = cut(frames, None, colours, len(frames) // 2, FOLLOWING)
         if not masks.any():
             break
-        grown = np.stack([cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) for mask in masks])
-        inside, outside = masks, grown == 0
+        inside, outside = masks, ~_grown(masks)
     return masks, others, colours.apart
 
 
 def _marked(
-    frames: np.ndarray, evidence: np.ndarray | None, hints: Hints, found: _Found | None
+    frames: np.ndarray, evidence: np.ndarray | None, moves: float, hints: Hints, found: _Found | None
 ) -> _Found | None:
     """From the box, or what was found without it, and then with the places that are the mover or are not."""
     if hints.box is not None:
         index = hints.box.frame
-        found = _from_seeds(frames, evidence, {index: boxed(frames[index], hints.box, hints.clicks)})
+        found = _from_seeds(frames, evidence, moves, {index: boxed(frames[index], hints.box, hints.clicks)})
     elif found is None:
         found = _by_colour(frames)
     marked = {click.frame for click in hints.clicks}
     if not marked or found is None:
         return found
     seeds = {index: clicked(frames[index], found[0][index], hints.clicks, index) for index in sorted(marked)}
-    return _from_seeds(frames, evidence, seeds)
+    return _from_seeds(frames, evidence, moves, seeds)
 
 
 def _from_seeds(
-    frames: np.ndarray, evidence: np.ndarray | None, seeds: dict[int, np.ndarray]
+    frames: np.ndarray, evidence: np.ndarray | None, moves: float, seeds: dict[int, np.ndarray]
 ) -> _Found | None:
     seeds = {index: seed for index, seed in seeds.items() if seed.any()}
     if not seeds:
@@ -240,7 +262,7 @@ def _from_seeds(
     inside = np.stack(list(seeds.values()))
     colours = Colours(frames[list(seeds)], inside, ~inside)
     start = max(seeds, key=lambda index: seeds[index].sum())
-    return *cut(frames, evidence, colours, start, seeds), colours.apart
+    return *cut(frames, evidence, colours, start, moves, seeds), colours.apart
 
 
 def _ground(masks: np.ndarray, motion: Motion | None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -255,14 +277,35 @@ def _ground(masks: np.ndarray, motion: Motion | None) -> tuple[np.ndarray, np.nd
     if not motion.known:
         return np.full(count, np.nan), None
     middle = _filled((boxes[:, 0] + boxes[:, 2]) / 2)
-    floor = np.full(count, np.nanpercentile(bottom, 80))
-    for _ in range(3):  # the floor's own row is where it is taken to rise and sink
-        shifts = motion.shifts(np.stack([middle, floor], axis=1))
-        sunk = np.concatenate([[0.0], np.cumsum(shifts[:, 1])])
-        if np.ptp(sunk) < 1.5:
-            sunk = np.zeros(count)
-        floor = sunk + np.nanpercentile(bottom - sunk, _LONGEST)
-    return floor, np.concatenate([[0.0], -np.cumsum(shifts[:, 0])])
+    first = np.nanpercentile(bottom, 80)
+    floor, gone = _carried(motion, middle, first)
+    for _ in range(8):  # where the floor is first, so that the mover reaches it and does not sink in
+        first += float(np.nanpercentile(bottom - floor, _LONGEST))
+        floor, gone = _carried(motion, middle, first)
+    return floor + _settled(bottom - floor, 0.06 * longest(masks)), -gone
+
+
+def _settled(above: np.ndarray, most: float) -> np.ndarray:
+    """What a floor that was carried from picture to picture is off by, (F,): a mover touches it now and then.
+
+    Args:
+        above: How far the mover is below it, (F,), pixels; nan where it is not seen.
+        most: By which it is moved at most.
+    """
+    padded = np.pad(above, _TOUCHES // 2, constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, _TOUCHES)
+    return cv2.blur(np.clip(np.nan_to_num(np.nanmax(around, axis=1)), -most, most)[:, None], (1, _TOUCHES))[
+        :, 0
+    ]
+
+
+def _carried(motion: Motion, columns: np.ndarray, row: float) -> tuple[np.ndarray, np.ndarray]:
+    """The row of what lies still at a row of the first picture, (F,), and by how much it goes right, (F,)."""
+    rows, gone = np.full(len(columns), row), np.zeros(len(columns))
+    for index, move in enumerate(motion.maps):
+        x, y = move @ (columns[index], rows[index], 1.0)
+        rows[index + 1], gone[index + 1] = y, gone[index] + x - columns[index]
+    return rows, gone
 
 
 def _filled(track: np.ndarray) -> np.ndarray:

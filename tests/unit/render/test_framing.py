@@ -14,7 +14,9 @@ from onedemo.render.framing import Extent, clip_sides, film_sides, views_of
 from onedemo.render.mover import BODY, is_studio, locate
 from onedemo.render.renderer import CLOSE_HEIGHT, CLOSE_WIDTH, Renderer, studio
 from onedemo.robots.hopper import joint_points
+from onedemo.robots.registry import robot_named
 
+CAMERA = robot_named("hopper").camera
 STANDING = Extent(left=-0.2, right=0.3, low=0.0, high=1.5)
 FLYING = Extent(left=-0.6, right=0.5, low=0.7, high=1.6)
 
@@ -153,7 +155,7 @@ def test_what_moves_before_a_background_is_followed_and_as_large_as_the_robot():
     for i in (5, 30, 50):
         assert np.abs(mover.box[i] - [20 + 4 * i, 90, 60 + 4 * i, 210]).max() < 5
     k = np.arange(20, 30)
-    side = film_sides([film[k], film[k]], [mover.at(k), mover.at(k)])[0]
+    side = film_sides([film[k], film[k]], [mover.at(k), mover.at(k)], CAMERA)[0]
     wide, tall = side.known["seen"]
     assert wide < 0.8 * film.shape[2] and len(side.known["ghost"]) >= 4
     for picture, (x, y) in zip(side.pictures, side.known["offsets"], strict=True):
@@ -168,7 +170,7 @@ def test_where_all_moves_or_nothing_does_the_picture_is_shown_whole():
     still = np.full((30, 120, 160, 3), 128, np.uint8)
     for film in (shaking, still):
         assert locate(film) is None
-        side = film_sides([film[:5]], [None])[0]
+        side = film_sides([film[:5]], [None], CAMERA)[0]
         assert side.pictures.shape == (5, CLOSE_HEIGHT, CLOSE_WIDTH, 3) and not side.known
 
 
@@ -177,7 +179,7 @@ def test_a_view_that_would_be_larger_than_the_video_is_not_taken():
     mover = locate(film)
     assert mover is not None
     large = replace(mover.at(k), box=np.tile([1.0, 5.0, 315.0, 235.0], (5, 1)))
-    side = film_sides([film[k]], [large])[0]
+    side = film_sides([film[k]], [large], CAMERA)[0]
     assert side.pictures.shape[1:3] == (CLOSE_HEIGHT, CLOSE_WIDTH) and not side.known
 
 
@@ -185,7 +187,7 @@ def test_a_clip_notes_what_the_page_draws(tmp_path):
     film = person()
     k = np.arange(10)
     mover = locate(film)
-    about = read_about(compose_clip(*film_sides([film[k], film[k]], [mover.at(k), mover.at(k)])))
+    about = read_about(compose_clip(*film_sides([film[k], film[k]], [mover.at(k), mover.at(k)], CAMERA)))
     assert about["frames"] == 10 and len(about["sides"]) == 2
     for side in about["sides"]:
         assert len(side["left"]) == len(side["offsets"]) == 10 and not math.isnan(side["bottom"])

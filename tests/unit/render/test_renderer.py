@@ -15,8 +15,9 @@ import pytest
 from helpers.paths import ROOT
 from onedemo.demos.frame_clock import frame_of_step, steps_of_frames
 from onedemo.render import renderer as renderer_module
-from onedemo.render.backdrop import CHECK_DARK, CHECK_LIGHT, LANE, SKY_HORIZON, SKY_TOP, Camera, backdrop
-from onedemo.render.renderer import HEIGHT, WIDTH, Renderer, RenderThread
+from onedemo.render.backdrop import CHECK_DARK, CHECK_LIGHT, LANE, SKY_HORIZON, SKY_TOP, Viewpoint, backdrop
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import HEIGHT, WIDTH, Renderer
 
 STANDING = np.array([0, 1.25, 0, 0, 0, 0.0])
 
@@ -64,7 +65,7 @@ def test_steps_of_frames_are_the_nearest_in_time():
 
 # --- the backdrop ---------------------------------------------------------------------------------
 
-CAMERA = Camera(x=0.0, z=1.0, distance=3.0, fovy=45.0)
+CAMERA = Viewpoint(x=0.0, z=1.0, distance=3.0, fovy=45.0)
 
 
 def test_backdrop_is_sky_above_and_floor_below():
@@ -91,7 +92,7 @@ def test_far_floor_does_not_shimmer():
 
 def test_shadow_is_darkest_under_a_low_limb_and_softer_under_a_high_one():
     def darkest(height):
-        limb = np.array([[-0.2, 0.2, height, 0.05]])
+        limb = np.array([[-0.2, 0.2, height, 0.05, 0.0]])
         plain = backdrop(480, 360, CAMERA).astype(int)
         return (plain - backdrop(480, 360, CAMERA, limb)).max()
 
@@ -100,7 +101,7 @@ def test_shadow_is_darkest_under_a_low_limb_and_softer_under_a_high_one():
 
 
 def test_backdrop_survives_a_limb_out_of_the_picture():
-    limb = np.array([[900.0, 901.0, 0.0, 0.05]])
+    limb = np.array([[900.0, 901.0, 0.0, 0.05, 0.0]])
     assert np.array_equal(backdrop(64, 48, CAMERA, limb), backdrop(64, 48, CAMERA))
 
 
@@ -198,7 +199,7 @@ def test_what_is_read_of_a_picture_holds_all_of_the_robot(monkeypatch):
     with Renderer() as renderer, Renderer(exact=False) as quick:
         cut, people = renderer.render(poses).astype(int), quick.render(poses).astype(int)
         monkeypatch.setattr(
-            renderer_module, "_part", lambda limbs, top, camera, window, width, height: (0, 0, width, height)
+            renderer_module, "_part", lambda shape, eye, window, width, height: (0, 0, width, height)
         )
         assert np.array_equal(renderer.render(poses), cut)
     apart = np.abs(people - cut).max(-1)
@@ -292,7 +293,8 @@ from onedemo.core.process import prepare_process
 prepare_process()
 import onedemo.sim.vector_env, mujoco
 from onedemo.errors import UserError
-from onedemo.render.renderer import Renderer, RenderThread
+from onedemo.render.render_thread import RenderThread
+from onedemo.render.renderer import Renderer
 mujoco.MjModel.from_xml_string("<mujoco/>")
 for make in (Renderer, RenderThread):
     try:
@@ -360,7 +362,8 @@ def test_software_draws_the_same_where_egl_does_not_work(tmp_path):
         pytest.skip("there is no OSMesa: install the package libosmesa6")
     code = (
         "import sys, numpy as np\nfrom onedemo.core.process import prepare_process\nprepare_process()\n"
-        "from onedemo.render.renderer import Renderer, RenderThread\n"
+        "from onedemo.render.render_thread import RenderThread\n"
+        "from onedemo.render.renderer import Renderer\n"
         "qpos = np.array([[0, 1.25, 0, 0, 0, 0.0]])\n"
         "with Renderer() as own, RenderThread() as other:\n"  # two contexts, of two threads
         "    pictures = [own.render(qpos), other.render(qpos).result(), own.render(qpos)]\n"

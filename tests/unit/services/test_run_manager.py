@@ -16,7 +16,7 @@ from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path
 from onedemo.demos.library import find_demo, rename_demo
 from onedemo.errors import UserError
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.storage.store import Store
 from onedemo.training.rating_queue import Simulated
 from onedemo.training.runs import add_run

@@ -6,8 +6,9 @@ import pytest
 from helpers.small_world import falling_demo, falling_states
 from onedemo.app.tabs.progress import timeline_html
 from onedemo.demos.video import VideoReader, count_frames
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.rl.rollouts import Transitions
+from onedemo.robots.registry import robot_named
 from onedemo.training.best_rollouts import PARTS, Episode, Gallery
 from onedemo.training.pictures import PictureFiles, captioned
 from onedemo.types import Rollouts
@@ -81,7 +82,7 @@ def test_the_best_rollout_is_drawn_when_asked_for_and_once(tmp_path):
     demo = falling_demo(tmp_path / "demo")
     states = falling_states()
     with RenderThread() as drawing:
-        gallery = Gallery(tmp_path / "rollouts", PictureFiles(drawing, demo, 0.008))
+        gallery = Gallery(tmp_path / "rollouts", PictureFiles(drawing, demo, robot_named("hopper")))
         gallery.keep(7, states.qpos[:125], np.arange(125) * 30 * 8 // 1000)
         strip = gallery.picture(7, "jpg").result(60)
         picture = cv2.imread(str(strip))

@@ -7,6 +7,7 @@ import threading
 import time
 from concurrent.futures import Future
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from helpers.small_world import falling_demo, small_config
 from onedemo.app.cli.main import main
 from onedemo.core.files import jpeg_fault, replacing
 from onedemo.demos.library import find_demo
-from onedemo.render.renderer import Order, Renderer, RenderThread
+from onedemo.render.render_thread import Order, RenderThread
+from onedemo.render.renderer import Renderer
+from onedemo.robots.registry import robot_named
 from onedemo.storage.clips import NewClip
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.store import Store
@@ -35,7 +38,7 @@ class Asked:
     def __init__(self):
         self.jobs = []
 
-    def submit(self, job, order=Order.AHEAD):
+    def submit(self, job, order=Order.AHEAD, robot=None):
         self.jobs.append((job, order, Future()))
         return self.jobs[-1][2]
 
@@ -48,7 +51,7 @@ def demo_of(frames, fps):
 def test_a_clip_stands_beside_the_frames_that_it_is_learned_beside(tmp_path, frames, fps):
     demo, drawing = demo_of(frames, fps), Asked()
     learner = Learner(small_config(), demo.frames, demo.fps)
-    pictures = PictureFiles(drawing, demo, learner.dt)
+    pictures = PictureFiles(drawing, demo, robot_named("hopper"))
     for step in (0, 7, learner.demo_steps - 30, learner.demo_steps - 5, learner.demo_steps + 9):
         moving = np.arange(38 * 6, dtype=float).reshape(38, 6)
         segment = Segment(obs=moving, actions=moving, qpos=moving, qvel=moving)
@@ -60,7 +63,7 @@ def test_a_clip_stands_beside_the_frames_that_it_is_learned_beside(tmp_path, fra
 
 def test_what_is_asked_twice_is_drawn_once_and_what_failed_is_drawn_again(tmp_path):
     drawing = Asked()
-    pictures = PictureFiles(drawing, demo_of(30, 30.0), 0.008)
+    pictures = PictureFiles(drawing, demo_of(30, 30.0), robot_named("hopper"))
     file = tmp_path / "film.webm"
     asked = [pictures.draw(file, lambda: lambda renderer: None, Order.FILM) for _ in range(12)]
     assert len(drawing.jobs) == 1 and not asked[0].done()
@@ -84,7 +87,7 @@ def test_a_film_that_took_long_is_there_for_whoever_waited(tmp_path, monkeypatch
     now = [0.0]
     monkeypatch.setattr("onedemo.training.pictures.time.monotonic", lambda: now[0])
     drawing = Asked()
-    pictures = PictureFiles(drawing, demo_of(30, 30.0), 0.008)
+    pictures = PictureFiles(drawing, demo_of(30, 30.0), robot_named("hopper"))
     film, ahead = tmp_path / "film.webm", tmp_path / "ahead.jpg"
     pictures.draw(film, lambda: lambda renderer: None, Order.FILM)
     pictures.draw(ahead, lambda: lambda renderer: None, Order.AHEAD)
@@ -125,7 +128,7 @@ def test_a_thousand_ratings_leave_twenty_megabytes_and_can_be_looked_back_at(tmp
     with closing(Store(tmp_path)) as store, RenderThread(exact=False) as drawing:
         files = RunDirectory(tmp_path, "r")
         clips = thousand(store)
-        pictures = PictureFiles(drawing, demo, 0.008)
+        pictures = PictureFiles(drawing, demo, robot_named("hopper"))
         maker = ClipMaker(store, file=files.clip, pictures=pictures)
         maker.submit(clips[::100])
         drawing.submit(lambda renderer: None).result(120)
@@ -174,7 +177,9 @@ def test_whoever_draws_waits_for_no_lock_of_another_program(tmp_path):
     with closing(Store(tmp_path)) as store:
         clips = thousand(store)[:4]
         files = RunDirectory(tmp_path, "r")
-        maker = ClipMaker(store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), 0.008))
+        maker = ClipMaker(
+            store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), robot_named("hopper"))
+        )
         with closing(sqlite3.connect(store.path, isolation_level=None)) as other:
             other.execute("BEGIN IMMEDIATE")
             began = time.monotonic()
@@ -217,7 +222,9 @@ def test_a_clip_that_fails_again_and_again_is_drawn_once_with_each_try(tmp_path,
     with closing(Store(tmp_path)) as store:
         store.clips.set_state([clip.id for clip in thousand(store)[3:]], "withdrawn")
         files = RunDirectory(tmp_path, "r")
-        maker = ClipMaker(store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), 0.008))
+        maker = ClipMaker(
+            store, file=files.clip, pictures=PictureFiles(drawing, demo_of(30, 30.0), robot_named("hopper"))
+        )
         for _ in range(3):  # the training fails, too, and takes the run up again
             maker.recover("r")
             for *_, drawn in drawing.jobs:
@@ -248,7 +255,7 @@ def test_a_film_lets_clips_go_first_and_ends_when_told_to(tmp_path, monkeypatch)
 
     order = []
     with RenderThread(exact=False) as drawing:
-        gallery = Gallery(tmp_path / "rollouts", PictureFiles(drawing, demo, 0.008))
+        gallery = Gallery(tmp_path / "rollouts", PictureFiles(drawing, demo, robot_named("hopper")))
         for iteration in (1, 2, 3):
             gallery.keep(iteration, np.zeros((125, 6)), np.arange(125) * 30 // 125)
         begun, go_on = threading.Event(), threading.Event()
@@ -295,7 +302,8 @@ def test_the_built_in_demo_is_read_once_for_all_clips(tmp_path):
 
     demo = find_demo("hopper-backflip", tmp_path)
     pictures._filmed.cache_clear()
-    assert pictures._filmed(demo)[0] is pictures._filmed(find_demo("hopper-backflip", tmp_path))[0]
+    filmed = partial(pictures._filmed, robot=robot_named("hopper"))
+    assert filmed(demo)[0] is filmed(find_demo("hopper-backflip", tmp_path))[0]
     pictures._filmed.cache_clear()
 
 

@@ -3,8 +3,11 @@ from pathlib import Path
 
 import pytest
 
+from helpers.paths import ROOT
 from onedemo.config import load_config
 from onedemo.errors import UserError
+from onedemo.robots import registry
+from onedemo.robots.library import add_robot, remove_robot
 from onedemo.storage.store import Store
 from onedemo.training.runs import add_run, disk_needed, find_run
 from onedemo.types import Demo
@@ -168,3 +171,44 @@ def test_a_run_is_found_although_its_demo_has_another_name(store, tmp_path):
     run = add_run(store, tmp_path, DEMO, load_config(), name=None)
     renamed = replace(DEMO, name="renamed")
     assert find_run(store, tmp_path, renamed, name=None, wanted=None) == (run, load_config())
+
+
+def test_a_run_goes_on_only_with_the_robot_it_was_made_with(store, tmp_path):
+    models = ROOT / "tests/data/robots"
+    registry.use(tmp_path)
+    try:
+        add_robot(models / "arm.xml", tmp_path, name="mine")
+        settings = load_config(None, {"env": "mine"})
+        run = add_run(store, tmp_path, DEMO, settings, name=None)
+        assert find_run(store, tmp_path, DEMO, name=run, wanted=settings) == (run, settings)
+        remove_robot("mine", tmp_path)
+        registry.use(tmp_path)
+        with pytest.raises(UserError, match="unknown robot 'mine'"):
+            find_run(store, tmp_path, DEMO, name=run, wanted=None)
+        add_robot(models / "tendons.xml", tmp_path, name="mine")
+        registry.use(tmp_path)
+        with pytest.raises(UserError, match=f"run '{run}' was made with another model of robot mine"):
+            find_run(store, tmp_path, DEMO, name=run, wanted=None)
+        with pytest.raises(UserError, match="settings are of a run with another model of robot mine"):
+            add_run(store, tmp_path, DEMO, replace(settings, env_sha256="0" * 64), name=None)
+    finally:
+        registry.use(None)
+
+
+def test_a_run_of_before_robots_were_noted_goes_on(store, tmp_path):
+    run = add_run(store, tmp_path, DEMO, load_config(), name=None)
+    file = tmp_path / "runs" / run / "config.toml"
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(line for line in lines if not line.startswith("env_sha256")))
+    assert len(lines) > len(file.read_text().splitlines())
+    assert find_run(store, tmp_path, DEMO, name=run, wanted=load_config()) == (run, load_config())
+
+
+def test_a_demo_of_another_robot_is_refused(store, tmp_path):
+    made = replace(DEMO, robot="walker2d")
+    with pytest.raises(UserError, match="shows robot 'walker2d', but this run's robot is"):
+        add_run(store, tmp_path, made, load_config(), name=None)
+    assert not store.runs.all()
+    assert add_run(store, tmp_path, made, load_config(None, {"env": "walker2d"}), name=None) == "flip-1"
+    with pytest.raises(UserError, match="unknown robot 'nobody'"):
+        add_run(store, tmp_path, made, load_config(None, {"env": "nobody"}), name=None)

@@ -238,17 +238,24 @@ def held_by_another(path):
     return done.returncode != 0
 
 
-def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, demo):
-    """Amid an iteration of many seconds: a second process is refused, then so is this one, then nobody."""
-    config = small_config(rollouts__steps=6_000, rollouts__total_steps=10**9, ratings__pretrain=1)
+def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, demo, monkeypatch):
+    """Amid an iteration: a second process is refused, then so is this one, then nobody."""
+    begun, go_on, iterate = threading.Event(), threading.Event(), TrainingRun.iterate
+
+    def long(self):
+        begun.set()
+        assert go_on.wait(60)
+        iterate(self)
+
+    monkeypatch.setattr(TrainingRun, "iterate", long)
+    config = small_config(rollouts__total_steps=10**9, ratings__pretrain=1)
     training = make_run(store, demo, config=config)
     with ExitStack() as held:
         held.enter_context(hold(training.files.lock))
         trainer_ = Trainer(training, held.pop_all())
     ann = store.accounts.ensure("Ann", "annotator")
     trainer_.start()
-    wait_for(lambda: rate_all(store, "r", ann) or (trainer_.status().phase == "online"))
-    wait_for(lambda: trainer_.status().snapshot == 1)
+    wait_for(lambda: rate_all(store, "r", ann) or begun.is_set())
     trainer_.stop(timeout_s=0.01)
     trainer_.release()
     assert trainer_.status().phase == "stopping" and trainer_.status().iteration == 0
@@ -256,6 +263,7 @@ def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, de
     with pytest.raises(UserError, match="another onedemo is working on"), hold(training.files.lock):
         pass
     assert trainer_.status().iteration == 0  # all of that within the iteration
+    go_on.set()
     trainer_.stop()
     assert trainer_.status().phase == "stopped" and trainer_.status().iteration == 1
     assert not held_by_another(training.files.lock)

@@ -19,7 +19,8 @@ import mujoco
 import numpy as np
 
 from onedemo.render.gl_context import open_context
-from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FOVY, Renderer
+from onedemo.render.renderer import Renderer
+from onedemo.robots.camera import FOVY, Camera
 from onedemo.robots.robot import Robot, model_of
 from onedemo.vision.silhouette_pictures import Eye
 
@@ -130,7 +131,8 @@ def _view(fovy: float, distance: float) -> float:
     return 2 * distance * math.tan(math.radians(fovy) / 2)
 
 
-_STUDIO = Eye(azimuth=90, elevation=0, distance=CAMERA_DISTANCE, view=_view(FOVY, CAMERA_DISTANCE))
+_CAMERA = Camera()  # of a robot of the hopper's size
+_STUDIO = Eye(azimuth=90, elevation=0, distance=_CAMERA.distance, view=_view(FOVY, _CAMERA.distance))
 VISER = Look(
     eye=Eye(azimuth=90, elevation=0, distance=3.0, view=_view(45, 3.0)), height=1.02, size=(480, 360),
     draw=viser_frames,
@@ -141,8 +143,8 @@ LOOKS: Mapping[str, Look] = {
         draw=gymnasium_frames,
     ),
     "mjviser's colours": VISER,
-    "ours, other colours": Look(eye=_STUDIO, height=CAMERA_HEIGHT, size=(480, 360), draw=turned_frames),
-    "ours": Look(eye=_STUDIO, height=CAMERA_HEIGHT, size=(480, 360), draw=our_frames),
+    "ours, other colours": Look(eye=_STUDIO, height=_CAMERA.height, size=(480, 360), draw=turned_frames),
+    "ours": Look(eye=_STUDIO, height=_CAMERA.height, size=(480, 360), draw=our_frames),
 }  # fmt: skip
 
 

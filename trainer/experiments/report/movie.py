@@ -10,7 +10,7 @@ import numpy as np
 
 from onedemo.demos.library import read_frames
 from onedemo.render.clip_image import frame_durations, side_by_side
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.types import Demo
 
 MOST_BYTES = 400_000

@@ -22,7 +22,7 @@ from onedemo.demos.library import find_demo, read_frames
 from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 from onedemo.experiments.speed.figures import Figure, Growth, Result, Skipped, by_turns, ratio, single
-from onedemo.render.renderer import RenderThread
+from onedemo.render.render_thread import RenderThread
 from onedemo.reward.model import visual_inputs
 from onedemo.types import Demo
 from onedemo.vision.encoders import EfficientNetLite0, demo_features, published_lite0
