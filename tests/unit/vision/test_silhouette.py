@@ -173,10 +173,10 @@ def test_a_fit_explains_films_held_out_and_says_how_well(learned, simple):
         learned.read(Views(crops=c, places=p))[0]
         for c, p in zip(simple.crops[held_out], simple.places[held_out], strict=True)
     ]
-    error = np.square(np.stack(read) - simple.aims[held_out]).mean(axis=(0, 1))
-    some = [0, 1, 2, 6]
-    explained = 1 - error / simple.aims[held_out].var(axis=(0, 1))
-    np.testing.assert_allclose(learned.held_out[some], explained[some], atol=1e-3)
+    some = [0, 1, 2, 6]  # the others do not vary
+    aims = simple.aims[held_out][..., some]
+    error = np.square(np.stack(read)[..., some] - aims).mean(axis=(0, 1))
+    np.testing.assert_allclose(learned.held_out[some], 1 - error / aims.var(axis=(0, 1)), atol=1e-3)
 
 
 @pytest.mark.slow
@@ -255,11 +255,6 @@ def test_a_video_of_another_frame_rate_and_with_nothing_in_it(learned, simple):
     assert learned.track(found(none), 30.0) is None
     nothing, doubt = learned.numbers(found(none), 30.0)
     assert (doubt == 1).all() and np.isfinite(nothing).all()
-    blind = learned.track(found(masks, way=None, floor=np.full(FRAMES, np.nan)), 30.0)
-    assert blind.travel is None and blind.contact is None
-    whole = learned.track(found(masks), 30.0)
-    assert whole.travel.shape == whole.contact.shape == (FRAMES,)
-    np.testing.assert_allclose(np.linalg.norm(whole.pose[:, 1:], axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.seam
@@ -324,11 +319,18 @@ def read_frames_of(demo):
 @pytest.mark.parametrize("name", ["hopper-backflip", "hopper-flip-clean", "hopper-hop"])
 def test_it_reads_the_built_in_demos_better_than_what_ships_beside_them(name, tmp_path):
     demo, learned = find_demo(name, tmp_path / "demos"), learn("hopper", tmp_path)
-    track, right = learned.track(masks_of(demo, learned.reach), demo.fps), read_frames_of(demo)
+    found, right = masks_of(demo, learned.reach), read_frames_of(demo)
+    track = learned.track(found, demo.fps)
     error = np.sqrt(np.square(track.pose - right[:, :9]).mean())
     assert error < 0.15 and error < np.sqrt(np.square(shipped_track(demo).pose - right[:, :9]).mean())
     assert np.sqrt(np.square(track.travel - right[:, -2] / TRAVEL_SCALE).mean()) < 1.3  # m/s
     assert np.median(track.doubt) < 0.35
+    waves = track.pose[:, 1:].reshape(-1, 2)
+    np.testing.assert_allclose(np.linalg.norm(waves, axis=1), 1, atol=1e-5)
+    blind = replace(found, way=None, floor=np.full(demo.frames, np.nan))
+    known = learned.track(blind, demo.fps)
+    assert known.travel is None and known.contact is None
+    assert np.sqrt(np.square(known.pose[:, 1:] - right[:, 1:9]).mean()) < 0.2
 
 
 def shapes():
