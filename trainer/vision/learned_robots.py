@@ -22,9 +22,12 @@ SHIPPED = Path(static.__file__).parent / "robots"
 
 
 def model_name(env_name: str) -> str:
-    """Names a robot and its model."""
-    model = hashlib.sha256(robot_named(env_name).xml.read_bytes()).hexdigest()[:12]
-    return f"{check_name(env_name)}-{model}"
+    """Names a robot, its model, and the plane in which it is seen, unless that is upright."""
+    robot = robot_named(env_name)
+    model = robot.model_sha256 or hashlib.sha256(robot.xml.read_bytes()).hexdigest()
+    plane = (robot.camera.right, robot.camera.up)
+    seen = "" if plane == (0, 2) else "-{}{}".format(*plane)
+    return f"{check_name(env_name.replace(':', '-'))}-{model[:12]}{seen}"
 
 
 def find(name: str, cache_dir: Path, *, shipped: bool = True) -> dict[str, np.ndarray] | None:

@@ -126,12 +126,11 @@ class Silhouette:
     def track(self, found: Masks, fps: float) -> Track | None:
         """Pose, motion, travel and contact in the frames of a video; None if it shows another body.
 
-        Arguments as of ``numbers``. The doubt is also that of the masks.
+        Arguments as of ``numbers``.
         """
         at, doubt = self.numbers(found, fps)
         if np.median(doubt) > _ANOTHER:
             return None
-        doubt = np.maximum(doubt, found.doubt)
         pose, motion = at[:, : self._pose], at[:, self._pose : 2 * self._pose]
         waves = pose[:, 1:].reshape(len(pose), -1, 2)
         lengths = np.linalg.norm(waves, axis=-1, keepdims=True)

@@ -159,8 +159,7 @@ class Eye:
 
 def facing(robot: Robot) -> Eye:
     """The robot's own camera; it shows about three metres."""
-    axes = np.eye(3)
-    ahead = -np.cross(axes[robot.camera.right], axes[robot.camera.up])
+    ahead = robot.camera.forward
     azimuth = math.degrees(math.atan2(ahead[1], ahead[0])) if abs(ahead[2]) < 0.5 else 90.0
     elevation = math.degrees(math.asin(ahead[2]))
     return Eye(azimuth=azimuth, elevation=elevation, distance=robot.camera.distance, view=3.0)

@@ -167,16 +167,16 @@ def learned(simple):
 
 @pytest.mark.slow
 def test_a_fit_explains_films_held_out_and_says_how_well(learned, simple):
-    assert learned.held_out[[0, 1, 2]].min() > 0.6
+    assert learned.held_out[[0, 1, 6]].min() > 0.8 and learned.held_out[2] > 0.5
     held_out = slice(90, None)
     read = [
         learned.read(Views(crops=c, places=p))[0]
         for c, p in zip(simple.crops[held_out], simple.places[held_out], strict=True)
     ]
-    error = np.square(np.stack(read) - simple.aims[held_out]).mean(axis=(0, 1))
-    np.testing.assert_allclose(
-        learned.held_out, 1 - error / simple.aims[held_out].var(axis=(0, 1)), atol=1e-3
-    )
+    some = [0, 1, 2, 6]  # the others do not vary
+    aims = simple.aims[held_out][..., some]
+    error = np.square(np.stack(read)[..., some] - aims).mean(axis=(0, 1))
+    np.testing.assert_allclose(learned.held_out[some], 1 - error / aims.var(axis=(0, 1)), atol=1e-3)
 
 
 @pytest.mark.slow
@@ -242,23 +242,19 @@ def test_limbs_that_are_alike_keep_their_places_through_a_video():
     assert np.abs(mixed - numbers).max() > 0.5
 
 
-def test_a_video_of_another_frame_rate_and_with_nothing_in_it(learned):
-    masks = np.roll(bar(count=30), 0, axis=0)
-    plain, doubt = learned.numbers(masks_in(masks), 30.0)
-    fast, _ = learned.numbers(masks_in(np.repeat(masks, 2, axis=0)), 60.0)
-    assert plain.shape == (30, 8) and len(fast) == 60 and doubt.max() < 1
-    np.testing.assert_allclose(fast[10:50:2], plain[5:25], atol=0.1)
-    unsure = learned.track(masks_in(masks, doubt=np.full(30, 0.9)), 30.0)
-    assert (unsure.doubt >= 0.9).all()
-    assert learned.track(masks_in(np.zeros_like(masks)), 30.0) is None
-    nothing, doubt = learned.numbers(masks_in(np.zeros_like(masks)), 30.0)
+@pytest.mark.slow
+def test_a_video_of_another_frame_rate_and_with_nothing_in_it(learned, simple):
+    def found(masks, **more):
+        return masks_in(masks, scale=SIDE / 1.15 / REACH, **more)
+
+    masks, none = simple.crops[95] > 127, np.zeros((FRAMES, SIDE, SIDE), bool)
+    plain, doubt = learned.numbers(found(masks), 30.0)
+    fast, _ = learned.numbers(found(np.repeat(masks, 2, axis=0)), 60.0)
+    assert plain.shape == (FRAMES, 8) and len(fast) == 2 * FRAMES and doubt.max() < 1
+    np.testing.assert_allclose(fast[4:-4:2, :3], plain[2:-2, :3], atol=0.15)
+    assert learned.track(found(none), 30.0) is None
+    nothing, doubt = learned.numbers(found(none), 30.0)
     assert (doubt == 1).all() and np.isfinite(nothing).all()
-    blind = learned.track(masks_in(masks, way=None, floor=np.full(30, np.nan)), 30.0)
-    assert blind.travel is None and blind.contact is None
-    whole = learned.track(masks_in(masks), 30.0)
-    assert whole.travel.shape == whole.contact.shape == (30,)
-    waves = whole.pose[:, 1:]
-    np.testing.assert_allclose(np.linalg.norm(waves, axis=1), 1, atol=1e-5)
 
 
 @pytest.mark.seam
@@ -323,11 +319,18 @@ def read_frames_of(demo):
 @pytest.mark.parametrize("name", ["hopper-backflip", "hopper-flip-clean", "hopper-hop"])
 def test_it_reads_the_built_in_demos_better_than_what_ships_beside_them(name, tmp_path):
     demo, learned = find_demo(name, tmp_path / "demos"), learn("hopper", tmp_path)
-    track, right = learned.track(masks_of(demo, learned.reach), demo.fps), read_frames_of(demo)
+    found, right = masks_of(demo, learned.reach), read_frames_of(demo)
+    track = learned.track(found, demo.fps)
     error = np.sqrt(np.square(track.pose - right[:, :9]).mean())
     assert error < 0.15 and error < np.sqrt(np.square(shipped_track(demo).pose - right[:, :9]).mean())
     assert np.sqrt(np.square(track.travel - right[:, -2] / TRAVEL_SCALE).mean()) < 1.3  # m/s
-    assert np.median(track.doubt[track.doubt < 0.7]) < 0.35
+    assert np.median(track.doubt) < 0.35
+    waves = track.pose[:, 1:].reshape(-1, 2)
+    np.testing.assert_allclose(np.linalg.norm(waves, axis=1), 1, atol=1e-5)
+    blind = replace(found, way=None, floor=np.full(demo.frames, np.nan))
+    known = learned.track(blind, demo.fps)
+    assert known.travel is None and known.contact is None
+    assert np.sqrt(np.square(known.pose[:, 1:] - right[:, 1:9]).mean()) < 0.2
 
 
 def shapes():

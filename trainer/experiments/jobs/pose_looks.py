@@ -113,7 +113,7 @@ def viser_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
 
 def our_frames(robot: Robot, qpos: np.ndarray) -> np.ndarray:
     """As this program draws."""
-    with Renderer(model_path=robot.xml) as renderer:
+    with Renderer(robot=robot) as renderer:
         return renderer.render(qpos)
 
 
