@@ -84,7 +84,9 @@ class Oracle(DistanceAnnotator):
         self.body = body_of(robot_named(robot))
         """Of the robot."""
         given_ones = thresholds_of(self.body) if thresholds is None else thresholds
-        super().__init__(given_ones, budget=budget, given=given, seed=seed, errors=errors)
+        super().__init__(
+            given_ones, dt=self.body.robot.dt, budget=budget, given=given, seed=seed, errors=errors
+        )
         self.hidden = hidden
         """The demo's states."""
         self._demo = appearance(hidden.qpos, hidden.qvel, self.body)

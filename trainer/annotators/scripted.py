@@ -64,10 +64,10 @@ class Script(DistanceAnnotator):
         seed: int = 0,
         errors: Errors = (),
     ) -> None:
-        super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
-        self._marks = marks
         self._body = body_of(robot_named(robot))
         self._dt = self._body.robot.dt
+        super().__init__(thresholds, dt=self._dt, budget=budget, given=given, seed=seed, errors=errors)
+        self._marks = marks
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance step by step, (W,), from the marks from control step ``demo_step`` on."""

@@ -34,8 +34,8 @@ LEAST_IS_BEST = ("state_error", "energy")
 
 _SEED = 10_000
 """Of the start states: the same for every policy, and used by no training."""
-_EVERY = 4
-"""Control steps between the moments that are aligned: about a frame."""
+_EVERY_SECONDS = 0.032
+"""Between the moments that are aligned: about a frame."""
 
 
 class Trained(Protocol):
@@ -180,11 +180,13 @@ def aligned_similarity(qpos: np.ndarray, qvel: np.ndarray, oracle: Oracle) -> np
     Returns:
         Mean rating, 1..5, (N,).
     """
-    every = slice(None, None, _EVERY)
+    dt = oracle.body.robot.dt
+    step = max(1, round(_EVERY_SECONDS / dt))
+    every = slice(None, None, step)
     demo = appearance(oracle.hidden.qpos[every], oracle.hidden.qvel[every], oracle.body)
     robot = appearance(qpos[:, every], qvel[:, every], oracle.body)
     distances = np.stack([np.linalg.norm(demo[:, None] - episode, axis=-1) for episode in robot])
-    band = round(ALIGN_SECONDS / (_EVERY * oracle.body.robot.dt))
+    band = round(ALIGN_SECONDS / (step * dt))
     path = align(distances, band)
     return oracle.rating_of(np.take_along_axis(distances, path[..., None], axis=-1)[..., 0]).mean(axis=-1)
 

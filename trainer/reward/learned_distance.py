@@ -43,16 +43,17 @@ from onedemo.storage.rating_records import RatedSegment
 
 _UPDATES = 300
 _RATE = 0.03
-_EVERY = 2
-"""Every so many steps of a clip enter a fit: neighbours are alike."""
-_EVERY_IMAGINED = 7
+_EVERY_SECONDS = 0.016
+"""Between the steps of a clip that enter a fit: neighbours are alike."""
+_EVERY_IMAGINED_SECONDS = 0.056
 """The same where the track is fitted, too, which takes longer."""
 _SPREAD = 0.3
 """Of the weights of an imagined track to begin with."""
 _RIDGE = 0.004
 """Of the penalty on them, a standard normal prior for about 125 ratings."""
-_PRIOR = {"pose": -1.0, "motion": -2.0, "travel": -1.0, "contact": -2.0}
-"""Log weights before any rating: a difference in pose or travel counts more than one in motion."""
+_PRIOR = {"pose": -1.0, "motion": -2.0, "travel": 1.0, "contact": -2.0}
+"""Log weights before any rating: a difference in pose counts more than one in motion, and one in travel most,
+since the floor goes by in all of the picture: standing beside 2.5 m/s is then a 3 if all else is alike."""
 _USUAL = 9
 """Numbers of a pose for which the prior is meant; the more there are, the less does each count."""
 PARTS = ("travel", "contact")
@@ -201,7 +202,8 @@ def fit(
     assert start is None or isinstance(start, MetricSnapshot), "predictor.fit has checked it"
     generator = torch.Generator().manual_seed(seed)
     seen = view.track is not None
-    every = _EVERY if seen else _EVERY_IMAGINED
+    between = _EVERY_SECONDS if seen else _EVERY_IMAGINED_SECONDS
+    every = max(1, round(between / robot_named(view.robot).dt))
     some = slice(every // 2, None, every)
     classes_n = torch.tensor([r.value - 1 for r in ratings])
     counts = torch.bincount(classes_n, minlength=CLASSES).float()
