@@ -171,8 +171,9 @@ class Renderer:
         return images
 
     def shapes(self, qpos_kq: np.ndarray) -> list[Shape]:
-        """How far the robot's geoms reach at each of some positions, (k, q); places away from the camera are
-        counted from the plane that it is ``Camera.distance`` before.
+        """How far the robot's geoms reach at each of some positions, (k, q).
+
+        Places away from the camera are counted from the plane that it is ``Camera.distance`` before.
         """
         found = []
         for qpos in np.asarray(qpos_kq, np.float64):
