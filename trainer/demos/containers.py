@@ -35,7 +35,8 @@ def check_file(path: Path) -> None:
     """Raises UserError, with what helps, if a path is not that of a file that may be a video."""
     text = str(path)
     if re.match(r"[a-z][a-z0-9+.-]+:/", text, re.IGNORECASE) and not path.exists():
-        raise UserError(f"{text} is a web address: download the video and give the file")
+        address = text.replace(":/", "://", 1)  # a path has lost the second one
+        raise UserError(f"{address} is a web address: download the video and give the file")
     if re.fullmatch(r"\d+|/dev/video\d*", text) and not path.is_file():
         raise UserError(f"{text} is a camera: record a video with it and give the file")
     try:

@@ -486,7 +486,10 @@ def test_what_was_stored_is_compared_with_what_came_in(video, library, monkeypat
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("https://www.youtube.com/watch?v=x", "is a web address: download the video"),
+        (
+            "https://www.youtube.com/watch?v=x",
+            "https://www.youtube.com/watch.v=x is a web address: download the video",
+        ),
         ("/dev/video0", "is a camera"),
         ("0", "is a camera"),
         ("/dev/null", "is a device"),
