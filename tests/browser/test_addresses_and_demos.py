@@ -264,6 +264,11 @@ def follows_each_change(page, part):
     page.wait_for_selector("[data-part=edits-wrong] >> text=“Hold the background still” finds no background")
     assert not part("stabilise").is_checked() and part("loop").input_value() == "10"
     assert part("keep-it").is_enabled() and preview(page)
+    page.route("**/result", lambda route: route.abort())
+    part("mirror").check()
+    page.wait_for_selector("[data-part=edits-wrong] >> text=The server does not answer. Nothing is lost")
+    assert not part("mirror").is_checked() and part("keep-it").is_enabled() and preview(page)
+    page.unroute("**/result")
     part("speed").fill("1")
     part("reverse").uncheck()
     part("loop").select_option("1")
