@@ -37,6 +37,8 @@ def test_what_moves_is_shown_marked_and_kept(chromium, site, tmp_path):
         assert moves("said").inner_text().startswith("Found against a background that stands still. Sure in")
         # It is drawn over the frame that is looked at, and its frames are walked by keys.
         moves("at").focus()
+        page.keyboard.press("End")
+        page.wait_for_selector("[data-moves-part=frame-said] >> text=Frame 36 of 36")
         page.keyboard.press("Home")
         page.wait_for_selector("[data-moves-part=frame-said] >> text=Frame 1 of 36")
         page.wait_for_function(f"() => ({TINTED})() > 0.02")
