@@ -40,6 +40,7 @@ const moves = (() => {
     video().play().catch(() => {});
     part("at").max = about.frames - 1;
     [part("drawn").width, part("drawn").height] = [about.width, about.height];
+    part("frame").style.setProperty("--od-wide", about.width / about.height);
     choose("");
     find();
     requestAnimationFrame(follow);
@@ -286,6 +287,8 @@ const moves = (() => {
       }
     });
     pad.addEventListener("blur", () => (cross = corner = null));
+    for (const name of ["pointerdown", "keydown"])
+      part("at").addEventListener(name, (event) => event.key === "Tab" || video().pause());
     part("at").addEventListener("input", (event) => go(Number(event.target.value)));
     part("play").addEventListener("click", toggle);
     for (const name of ["play", "pause"])

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import re
 import secrets
 import shutil
@@ -36,6 +37,7 @@ from onedemo.demos.preparing import VIDEO, prepare_demo
 from onedemo.demos.sandboxed_decoder import Look, look
 from onedemo.demos.video import jpeg
 from onedemo.errors import UserError
+from onedemo.vision.mask_file import FILE_NAME as MASKS
 
 LARGEST = 500 << 20
 """Bytes of a video."""
@@ -193,10 +195,11 @@ class Uploads:
     async def result_of(self, request: web.Request) -> AsyncIterator[Path]:
         """Where what the demo would be lies, for one request at a time that works on it."""
         async with self._upload(request) as upload:
-            with self._at_work(), _sentences("mask"), _named(upload.result / "video.webm"):
-                if not (upload.result / "demo.json").is_file():
+            place = upload.result(upload.shown)
+            with self._at_work(), _sentences("mask"), _named(place / VIDEO):
+                if not upload.shown:
                     raise ValueError("choose a part and look at the result first")
-                yield upload.result
+                yield place
 
     async def result(self, request: web.Request) -> web.StreamResponse:
         """What the demo would be, as video."""
@@ -222,6 +225,9 @@ class Uploads:
                 name = request.query.get("name", "").strip()
                 work = partial(keep_demo, upload.result(upload.shown), name, self._demos_dir)
                 demo = await asyncio.to_thread(work)
+                marked = upload.result(upload.shown) / MASKS
+                if marked.is_file() and demo.path.name == VIDEO:  # of a demo that there was
+                    os.replace(marked, demo.path.with_name(MASKS))
         self._end(request.match_info["upload"])
         return web.json_response({"name": demo.name, "known": demo.name != name})
 

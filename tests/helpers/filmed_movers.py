@@ -14,7 +14,10 @@ import numpy as np
 from helpers import stick_figure
 from onedemo.demos.frame_clock import steps_of_frames
 from onedemo.demos.library import BUILT_IN
-from onedemo.render.renderer import CAMERA_DISTANCE, CAMERA_HEIGHT, FOVY, FREE_ABOVE, HOPPER_XML
+from onedemo.render.stage import FOVY, free_above
+from onedemo.robots.registry import robot_named
+
+HOPPER = robot_named("hopper")
 
 FPS = 30.0
 DT = 0.008
@@ -49,7 +52,7 @@ def by_gymnasium(
     qpos: np.ndarray, size: tuple[int, int] = (240, 240), colour: tuple[float, ...] | None = None
 ) -> Film:
     """As gymnasium's own renderer and tracking camera draw the hopper, in its colours or in one other."""
-    model = mujoco.MjModel.from_xml_path(str(HOPPER_XML))
+    model = mujoco.MjModel.from_xml_path(str(HOPPER.xml))
     if colour is not None:
         model.geom_rgba[model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE] = (*colour, 1)
     return _drawn(model, qpos, size, "track")
@@ -57,34 +60,34 @@ def by_gymnasium(
 
 def in_the_studio(qpos: np.ndarray, size: tuple[int, int] = (320, 240)) -> np.ndarray:
     """What of the program's own pictures is the robot, (F, H, W)."""
-    model = mujoco.MjModel.from_xml_path(str(HOPPER_XML))
+    model = mujoco.MjModel.from_xml_path(str(HOPPER.xml))
     model.vis.global_.fovy = FOVY
     return _drawn(model, qpos, size, None).masks
 
 
 def _drawn(model: mujoco.MjModel, qpos: np.ndarray, size: tuple[int, int], camera: str | None) -> Film:
     width, height = size
-    model.vis.global_.offwidth, model.vis.global_.offheight = max(640, 2 * width), max(480, 2 * height)
+    model.vis.global_.offwidth, model.vis.global_.offheight = max(640, width), max(480, height)
     data = mujoco.MjData(model)
     view: str | mujoco.MjvCamera = camera or mujoco.MjvCamera()
     frames, masks, way, floor = [], [], [], []
-    with mujoco.Renderer(model, 2 * height, 2 * width) as renderer:
+    with mujoco.Renderer(model, height, width) as renderer:
         for q in qpos:
             data.qpos[:] = q
             mujoco.mj_forward(model, data)
             if isinstance(view, mujoco.MjvCamera):
-                view.azimuth, view.elevation, view.distance = 90, 0, CAMERA_DISTANCE
+                view.azimuth, view.elevation, view.distance = 90, 0, HOPPER.camera.distance
                 top = _top(model, data)
-                height_m = CAMERA_HEIGHT + max(0.0, top - CAMERA_HEIGHT - FREE_ABOVE)
+                level = HOPPER.camera.height
+                height_m = level + max(0.0, top - level - free_above(HOPPER.camera))
                 view.lookat[:] = data.subtree_com[0, 0], 0, height_m
             renderer.update_scene(data, view)
-            frames.append(cv2.resize(renderer.render(), size, interpolation=cv2.INTER_AREA))
+            frames.append(renderer.render())
             renderer.enable_segmentation_rendering()
             shown = renderer.render()
             renderer.disable_segmentation_rendering()
             solid = (shown[..., 1] == mujoco.mjtObj.mjOBJ_GEOM) & (shown[..., 0] > 0)
-            share = cv2.resize(solid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-            masks.append(share > 0.5)
+            masks.append(solid)
             way.append(data.subtree_com[0, 0])
             floor.append(_floor(model, data, height))
     return Film(np.stack(frames), np.stack(masks), np.array(way) - way[0], np.array(floor))

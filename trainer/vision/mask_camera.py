@@ -23,7 +23,7 @@ _AGREES = 0.8
 """Pixels from where the map puts a corner."""
 _ROUND_TRIP = 0.6
 """Pixels from where it began, of a corner that is followed there and back."""
-_STANDS = 0.12
+STANDS = 0.12
 """Pixels a picture: what compression moves a camera that stands."""
 
 
@@ -46,16 +46,16 @@ class Motion:
         at = np.concatenate([place[:-1], np.ones((len(self.maps), 1))], axis=1)
         return np.einsum("fij,fj->fi", self.maps, at) - place[:-1]
 
-    def stands(self, size: tuple[int, int]) -> bool:
-        """Whether the camera does, for pictures of H rows and W columns, as far as it is known."""
+    def pace(self, size: tuple[int, int]) -> np.ndarray:
+        """By how much some places of pictures of H rows and W columns usually move, (5,), pixels a picture."""
         rows, columns = size
         moves = []
         even = np.ones((9, 1)) / 9  # grain shakes single moves, a camera that goes goes on
         for x, y in ((0.1, 0.5), (0.5, 0.9), (0.9, 0.5), (0.5, 0.1), (0.5, 0.5)):
             place = np.tile([x * columns, y * rows], (len(self.maps) + 1, 1))
             shifts = cv2.filter2D(self.shifts(place), -1, even, borderType=cv2.BORDER_REPLICATE)
-            moves.append(np.abs(shifts[self.told > 0]))
-        return not self.known or float(np.median(moves, axis=1).max()) < _STANDS
+            moves.append(np.median(np.abs(shifts[self.told > 0]), axis=0).max())
+        return np.array(moves)
 
 
 def follow_background(greys: np.ndarray, movers: np.ndarray | None = None) -> Motion:
