@@ -21,7 +21,7 @@ from onedemo.core.files import write_atomic
 from onedemo.core.names import check_description, check_name
 from onedemo.demos.library import list_demos
 from onedemo.errors import UserError
-from onedemo.robots.registry import robot_named
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.storage.comparisons import ANSWERS
 from onedemo.storage.run_directory import RunDirectory, check_run_name
 from onedemo.storage.store import Store
@@ -282,7 +282,7 @@ def _check_demos(runs: list[dict[str, Any]], data_dir: Path) -> None:
 def _widths(run: dict[str, Any], file: Path) -> dict[str, int]:
     """Columns of each array of a run's robot."""
     try:
-        robot = robot_named(str(tomllib.loads(run["config"]).get("env", "hopper")))
+        robot = robot_named(str(tomllib.loads(run["config"]).get("env", DEFAULT)))
     except UserError as error:
         raise UserError(f"{file}: run {run['id']}: {error}") from None
     return {

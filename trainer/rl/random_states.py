@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from onedemo.rl.rollouts import Collector, EpisodeRules, Starts, Transitions
-from onedemo.robots.registry import robot_named
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.robots.robot import Robot, floor_of, model_of
 from onedemo.sim import vector_env
 from onedemo.sim.kinematics import body_of
@@ -31,9 +31,7 @@ _SLIDE_SECONDS = 0.5
 """A slide goes from one end to the other in no less, within one deviation."""
 
 
-def random_states(
-    count: int, rng: np.random.Generator, name: str = "hopper"
-) -> tuple[np.ndarray, np.ndarray]:
+def random_states(count: int, rng: np.random.Generator, name: str = DEFAULT) -> tuple[np.ndarray, np.ndarray]:
     """States spread over what the robot can be in: any angle, spin and height above the ground.
 
     Args:
@@ -147,7 +145,7 @@ class RandomStarts(EpisodeRules):
         name: The robot.
     """
 
-    def __init__(self, standing: float = 0.0, name: str = "hopper") -> None:
+    def __init__(self, standing: float = 0.0, name: str = DEFAULT) -> None:
         self._standing, self._name = standing, name
 
     def start(self, lanes: np.ndarray, rng: np.random.Generator) -> Starts | None:

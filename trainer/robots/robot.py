@@ -199,10 +199,11 @@ class Robot:
             True where healthy, (...).
         """
         rule = self.stock
-        inside = np.ones(qpos.shape[:-1], bool)
         if np.isfinite(rule.healthy_state):
             others = qpos[..., self.unseen + 1 :]
             inside = np.maximum(np.abs(others).max(-1), np.abs(qvel).max(-1)) < rule.healthy_state
+        else:
+            inside = np.ones(qpos.shape[:-1], bool)
         if rule.healthy_height is not None:
             low, high = rule.healthy_height
             inside = inside & (low < qpos[..., self.height]) & (qpos[..., self.height] < high)

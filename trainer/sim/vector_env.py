@@ -289,12 +289,13 @@ class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _lost(self, before: np.ndarray) -> np.ndarray:
         """The lanes whose last step was not sound, (N,): they are put back to where they were before it."""
-        moved = np.abs(self._state[:, self._velocities]).max(axis=1)
-        whole = self._state[:, 0] - before[:, 0] > self._least
-        lost = ~(whole & (moved < _FASTEST))  # what is no number is not less, either
-        if lost.any():
-            self._state[lost] = before[lost]
-            self.unstable += int(lost.sum())
+        moved, took = self._state[:, self._velocities], self._state[:, 0] - before[:, 0]
+        # The usual case, quickly; what is no number is neither less nor more.
+        if took.min() > self._least and moved.max() < _FASTEST and moved.min() > -_FASTEST:
+            return np.zeros(self.num_envs, bool)
+        lost = ~((took > self._least) & (np.abs(moved).max(axis=1) < _FASTEST))
+        self._state[lost] = before[lost]
+        self.unstable += int(lost.sum())
         return lost
 
     def _restart(self, lanes: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Physics: our batched Hopper beside the simulator's own limit and beside other batched Hoppers.
+"""Physics: our batched robots beside the simulator's own limit, and the Hopper beside other batched Hoppers.
 
 A rate is control steps per second, all lanes together. N lanes, T control steps, a actions.
 """
@@ -17,7 +17,8 @@ from mujoco import rollout
 
 from onedemo.core.cpu import cores
 from onedemo.experiments.speed.figures import Growth, Result, Skipped, by_turns, ratio
-from onedemo.robots.registry import robot_named
+from onedemo.robots.registry import BUILT_IN, robot_named
+from onedemo.robots.robot import Robot, compiled
 from onedemo.sim import physics_profiling, vector_env
 from onedemo.sim.physics import load_model
 
@@ -29,16 +30,18 @@ _CONTROL = int(mujoco.mjtState.mjSTATE_CTRL.value)
 
 
 class Bare:
-    """``mujoco.rollout`` on the Hopper and nothing around it: what a batched Hopper can reach.
+    """``mujoco.rollout`` on a robot and nothing around it: what a batched robot can reach.
 
     Args:
         lanes: N.
+        robot: Which; the Hopper if None.
         shipped: The stock model, profiling and chunks as the Python package has them; else every
             setting that makes our own physics quick.
     """
 
-    def __init__(self, lanes: int, *, shipped: bool = False) -> None:
-        model = mujoco.MjModel.from_xml_path(str(_SPEC.xml)) if shipped else load_model(_SPEC.xml)
+    def __init__(self, lanes: int, robot: Robot | None = None, *, shipped: bool = False) -> None:
+        self._robot = robot or _SPEC
+        model = compiled(self._robot.xml) if shipped else load_model(self._robot.xml)
         self._models = [model] * lanes
         threads = min(cores(), lanes)
         self._pool = rollout.Rollout(nthread=threads)
@@ -56,7 +59,7 @@ class Bare:
             return self._run(states_NS, actions_TNa)
 
     def _run(self, states_NS: np.ndarray, actions_TNa: np.ndarray) -> float:
-        lanes, skip = len(states_NS), _SPEC.frame_skip
+        lanes, skip = len(states_NS), self._robot.frame_skip
         out = np.empty((lanes, skip, states_NS.shape[1]))
         control = np.empty((lanes, skip, actions_TNa.shape[2]))
         began = time.perf_counter()
@@ -84,6 +87,7 @@ def measure(quick: bool = False) -> list[Result]:
     turns, steps = (5, 40) if quick else (25, 125)
     return [
         *_against_bare(turns, steps),
+        *_each_against_bare(turns, steps),
         *_against_envpool(turns, steps),
         *_against_gymnasium(3 if quick else 9, steps, quick),
         _by_lanes(3 if quick else 9, quick),
@@ -111,12 +115,35 @@ def _against_bare(turns: int, steps: int) -> list[Result]:
     ]  # fmt: skip
 
 
-def _ours_and_bare(lanes: int, steps: int, turns: int, *, shipped: bool = False) -> dict[str, list[float]]:
-    env, bare = vector_env.make("hopper", lanes, horizon=10**9), Bare(lanes, shipped=shipped)
+def _each_against_bare(turns: int, steps: int) -> list[Result]:
+    """The same of each robot that comes with the program; the slower ones for fewer steps."""
+    rows: list[Result] = []
+    for name in BUILT_IN:
+        robot = robot_named(name)
+        steps_each = max(20, round(steps / (robot.velocities / _SPEC.velocities) ** 2))
+        rates = _ours_and_bare(LANES, steps_each, turns, robot=robot)
+        rows.append(
+            ratio(
+                f"physics_vs_bare_{name}", f"the same, {name}", ours=rates["ours"], theirs=rates["bare"],
+                against=f"mujoco.rollout bare, {cores()} threads", reach=0.95, unit="steps/s",
+                equal="as the first, of this robot",
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _ours_and_bare(
+    lanes: int, steps: int, turns: int, *, robot: Robot | None = None, shipped: bool = False
+) -> dict[str, list[float]]:
+    robot = robot or _SPEC
+    env = vector_env.RobotVectorEnv(robot, lanes, horizon=10**9)
+    bare = Bare(lanes, robot, shipped=shipped)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (steps, lanes, _SPEC.action_size))
-    for action in actions[:100]:  # spread: some fall, some fly
+    low, high = np.array(robot.low), np.array(robot.high)
+    actions = rng.uniform(-1, 1, (steps, lanes, robot.action_size))
+    commands = (low + high) / 2 + (high - low) / 2 * actions
+    for action in np.resize(actions, (100, *actions.shape[1:])):  # spread: some fall, some fly
         env.step(action)
     qpos, qvel, every = env.qpos, env.qvel, np.arange(lanes)
 
@@ -125,7 +152,7 @@ def _ours_and_bare(lanes: int, steps: int, turns: int, *, shipped: bool = False)
         return _rate(env.step, actions)
 
     def theirs() -> float:
-        return actions[..., 0].size / bare.run(full_states(qpos, qvel), actions)
+        return actions[..., 0].size / bare.run(full_states(qpos, qvel), commands)
 
     rates = by_turns({"ours": ours, "bare": theirs}, turns)
     env.close()
