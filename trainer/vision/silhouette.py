@@ -139,8 +139,8 @@ class Silhouette:
         stands = np.isfinite(found.floor).any()
         return Track(
             pose=pose.astype(np.float32), motion=motion.astype(np.float32),
-            travel=None if found.way is None else np.float32(at[:, -2] / TRAVEL_SCALE),
-            contact=np.float32(np.clip(at[:, -1], 0, 1)) if stands else None, doubt=doubt.astype(np.float32),
+            travel=None if found.way is None else (at[:, -2] / TRAVEL_SCALE).astype(np.float32),
+            contact=np.clip(at[:, -1], 0, 1).astype(np.float32) if stands else None, doubt=doubt.astype(np.float32),
         )  # fmt: skip
 
     @property

@@ -122,7 +122,7 @@ def _alike(model: mujoco.MjModel, robot: Robot, one: int, other: int) -> bool:
             model.body_pos[a, plane], model.body_pos[b, plane], atol=0.01
         ):
             return False
-        for sizes in (model.geom_size, model.geom_pos[:, plane], np.float64(model.geom_type)[:, None]):
+        for sizes in (model.geom_size, model.geom_pos[:, plane], model.geom_type[:, None]):
             if not np.allclose(sizes[geoms[0]], sizes[geoms[1]], atol=0.01):
                 return False
     return True
