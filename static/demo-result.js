@@ -17,8 +17,13 @@ function demoResult(part, hooks) {
   let again = false; // whether another is wanted by now
   let [due, videos] = [0, 0];
 
-  function begin() {
+  function wait(then) {
     clearTimeout(due);
+    due = then ? setTimeout(() => ((due = 0), then()), WAIT) : 0;
+  }
+
+  function begin() {
+    wait();
     videos += 1;
     [shown, work, again] = [null, null, false];
     fill(USUAL);
@@ -66,24 +71,24 @@ function demoResult(part, hooks) {
   // ---- what it would be
 
   function changed() {
-    clearTimeout(due);
+    wait();
     if (speedWrong()) return making(Boolean(work));
     if (same(shown, read()) && !work) return making(false);
     making(true);
-    due = setTimeout(() => update().catch(() => {}), WAIT);
+    wait(() => update().catch(() => {}));
   }
 
   function making(is) {
     part("preview").classList.toggle("od-making", is);
     part("preview").setAttribute("aria-busy", String(is));
     part("making").textContent = is ? "Showing the change…" : "";
-    part("keep-it").disabled = is || !shown || part("speed").ariaInvalid === "true";
+    part("keep-it").disabled = is || !shown || part("speed").getAttribute("aria-invalid") === "true";
   }
 
   // Asks for one result at a time, and for the newest choice once it is there. What cannot be done is undone;
   // rejected with the sentence if there is no result at all.
   function update() {
-    clearTimeout(due);
+    wait();
     again = Boolean(work);
     return (work ??= make(videos));
   }
@@ -104,9 +109,9 @@ function demoResult(part, hooks) {
         wrong = error;
         if (!again && shown) fill(shown);
       }
-    } while (again);
+    } while (again && !speedWrong());
     work = null;
-    making(false);
+    making(Boolean(due));
     say(wrong ? wrong.message : "");
     if (!shown) throw wrong;
   }
@@ -114,6 +119,7 @@ function demoResult(part, hooks) {
   // The first result of a part. What the options ask of another part may be more than this one can give.
   async function show() {
     await work?.catch(() => {}); // of the part before
+    if (speedWrong()) fill({ ...read(), speed: shown ? shown.speed : USUAL.speed });
     const before = shown;
     shown = null;
     try {

@@ -207,6 +207,7 @@ const demos = (() => {
     say("The part is being brought in: some seconds.");
     try {
       await preview.show();
+      if (of !== upload) return;
       say("");
       show("result");
       part("result").focus();

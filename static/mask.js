@@ -158,10 +158,10 @@ const moves = (() => {
     const at = part("at");
     if (document.activeElement !== at || !video().paused) at.value = frame;
     const unsure = found && found.doubt[frame] >= UNSURE;
-    const told = `${frame + 1} of ${facts.frames}${unsure ? ", unsure" : ""}`;
+    const told = `Frame ${frame + 1} of ${facts.frames}${unsure ? ", unsure" : ""}`;
     if (part("frame-said").textContent !== told) {
       part("frame-said").textContent = told;
-      at.setAttribute("aria-valuetext", `Frame ${told}`);
+      at.setAttribute("aria-valuetext", told);
     }
     const canvas = part("drawn");
     const pen = canvas.getContext("2d");

@@ -20,7 +20,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before torch: the cores are taken by 
 
 
 LONGEST = (
-    "test_rating_flow test_page test_end_to_end test_charts test_layout test_researcher test_served_product"
+    "test_end_to_end test_rating_flow test_page test_charts test_layout test_researcher test_served_product"
     " test_line test_faults test_trainer test_clip_player test_jobs test_accessible test_cli test_renderer"
     " test_learner test_backup_doctor test_addresses_and_demos test_resume test_start test_speed test_kills"
     " test_installed test_foreign_code test_custom test_security test_speed_pictures test_sandboxed_decoder"
@@ -46,6 +46,15 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         return (yield)
     finally:
         asyncio._set_running_loop(loop)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def warm_servers() -> None:
+    """Servers are forks of a process that has imported what they need."""
+    from helpers import warm
+    from load import serving
+
+    serving.begin = warm.begin
 
 
 @pytest.fixture(scope="session")
@@ -118,7 +127,13 @@ _ports: list[int] = []
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
+def live_fps() -> float:
+    """Frames a second of the live robot: without a GPU each keeps a core busy for a quarter of a second."""
+    return 0.5
+
+
+@pytest.fixture
+def site(tmp_path: Path, live_fps: float) -> Iterator[Site]:
     """A front with links for a researcher ("ada") and two annotators ("bo", "cy")."""
     from helpers.fake_trainer import StandIn
     from onedemo.app.annotation.assignment import Again
@@ -135,7 +150,7 @@ def site(tmp_path: Path) -> Iterator[Site]:
         pictures=Pictures(trainer.demo, read=lambda _: trainer.frames, track=lambda: trainer.track),
         again=Again(shared=0, repeated=0),
         guard_seconds=0.05,
-        live_fps=2.0,  # without a GPU each frame costs a tenth of a second
+        live_fps=live_fps,
     )
     try:
         front = Front(page, Listening(port=_ports.pop() if _ports else 0))

@@ -1,7 +1,7 @@
 """The records that move between the rooms. All frozen: what was measured does not change later.
 
-Shapes: N lanes (parallel episodes), T control steps, o = 11 observations, a = 3 actions,
-q = v = 6 positions and velocities. Arrays are lane-first, (N, T, ...).
+Shapes: N lanes (parallel episodes), T control steps, o observations, a actions, q positions and v velocities
+of the robot (of a hopper 11, 3, 6 and 6). Arrays are lane-first, (N, T, ...).
 """
 
 from __future__ import annotations

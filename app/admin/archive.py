@@ -21,6 +21,8 @@ FORMAT = 1
 
 _RUN = r"runs/[A-Za-z0-9_-]{1,84}"
 _FILE = r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,199}"
+_PART = r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]{0,199}"
+"""Of the path of a model's file, which somebody else has named: what ``onedemo.robots.model_files`` takes."""
 _NAMES = re.compile(
     "|".join(
         (
@@ -28,6 +30,8 @@ _NAMES = re.compile(
             "link-secret",
             rf"demos/[0-9a-f]{{64}}/{_FILE}\.(webm|json|npz)",
             rf"robots/{_FILE}\.npz",
+            r"robots/[0-9a-f]{64}/[A-Za-z0-9_-]{1,64}\.json",
+            rf"robots/[0-9a-f]{{64}}/model(/{_PART}){{1,16}}",
             rf"{_RUN}/(config\.toml|log|start\.pt|checkpoint(-before)?\.pt)",
             rf"{_RUN}/snapshots/\d{{6,15}}\.pt",
             rf"{_RUN}/(clips|pairs)/\d{{6,15}}(\.\d{{1,3}})?\.jpg",

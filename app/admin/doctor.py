@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 from onedemo.render.render_thread import RenderThread
 from onedemo.render.renderer import HEIGHT, WIDTH
+from onedemo.robots import registry
+from onedemo.robots.library import load_robot, robots_in
 from onedemo.storage.database import FILE_NAME, rescued_files
 from onedemo.storage.run_directory import RunDirectory
 from onedemo.storage.schema import STEPS, check_schema
@@ -72,11 +75,14 @@ def examine(data_dir: Path, *, full: bool = False) -> Iterator[Finding]:
         ("privacy", lambda: _privacy(data_dir)),
         ("rescued", lambda: _rescued(data_dir)),
     ]
+    if any(robots_in(data_dir)):
+        checks.append(("robots", lambda: _robots(data_dir)))
     if (data_dir / FILE_NAME).exists():
         checks += [
             ("database", lambda: _database(data_dir, full)),
             ("files", lambda: _files(data_dir)),
             ("demonstrations", lambda: _demos(data_dir)),
+            ("robots", lambda: _robots_of_runs(data_dir)),
         ]
     for what, check in checks:
         try:
@@ -297,6 +303,34 @@ def _demos(data_dir: Path) -> Iterator[Finding]:
         yield Finding("demonstrations", False, f"{_name(broken)} damaged: delete it and add the video again")
     elif not lost:
         yield Finding("demonstrations", True, f"{_count(len(there), 'video')} of your own, as brought in")
+
+
+def _robots(data_dir: Path) -> Iterator[Finding]:
+    """Whether a person's own robots are what was added."""
+    whole = 0
+    for _, file in robots_in(data_dir):
+        try:
+            load_robot(file)
+            whole += 1
+        except UserError as error:
+            yield Finding("robots", False, str(error))
+    if whole:
+        yield Finding("robots", True, f"{_count(whole, 'robot')} of your own, as added")
+
+
+def _robots_of_runs(data_dir: Path) -> Iterator[Finding]:
+    """Runs that cannot go on because their robot is gone or another."""
+    registry.use(data_dir)
+    with closing(_open(data_dir / FILE_NAME)) as db:
+        runs = db.execute("SELECT id, config FROM runs").fetchall()
+    for run, text in runs:
+        try:
+            config = tomllib.loads(text)
+            robot = registry.robot_named(str(config.get("env", registry.DEFAULT)))
+            if config.get("env_sha256", "") not in ("", robot.sha256):
+                raise UserError(f"robot {robot.name} has another model than it was made with")
+        except (UserError, tomllib.TOMLDecodeError) as error:
+            yield Finding("robots", False, f"run {run} cannot go on, {error}: put robots/ back from a backup")
 
 
 def _open(path: Path) -> sqlite3.Connection:

@@ -127,7 +127,7 @@ def verdict(alpha: float | None) -> str:
 
 def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
-    dt = next(entry["step_seconds"] for entry in store.runs.all() if entry["id"] == run)
+    dt = next((entry["step_seconds"] for entry in store.runs.all() if entry["id"] == run), 0.0)
     columns = ("clip_id", "rater", "value", "repeat", "latency_ms", "predicted", "steps")
     rows = store.ratings.newest(run, most, columns)
     return [

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from onedemo.robots.registry import DEFAULT, robot_named
-from onedemo.robots.robot import Robot, body_name, model_of
+from onedemo.robots.robot import Robot
 from onedemo.sim.kinematics import HEIGHT_SCALE, body_of
 from onedemo.vision.pose_estimator import Track
 
-_INNER, _OUTER, _LIMBS = 0.7, 0.5, 1.23
-"""How much the direction of a limb counts, beside 1 of the root, of one that carries others and of one that
-carries none; the sum of all their squares: however many there are, people see the robot as a whole."""
+_LIMBS = 1.23
+"""Sum of the squared weights of all limbs (``Body.weights``), beside 1 of the root: however many there are,
+people see the robot as a whole."""
 _BANDS = {5: (0.0, 0.0), 4: (0.75, 0.95), 3: (1.25, 1.45), 2: (1.7, 1.9), 1: (2.8, np.inf)}
 """Distances at which a clip is a clear case of a rating; 1 is a difference that is seen at once."""
 _PRACTICE = (5, 1, 3, 4, 2)
@@ -111,7 +111,7 @@ class _Chooser:
     Args:
         tracks: Of the demo, and of others by name.
         length: L.
-        weights: How much the direction of each axis counts, (A,).
+        weights: How much each axis and end counts, (A + K,).
     """
 
     def __init__(self, tracks: Mapping[str, Track], length: int, weights: np.ndarray) -> None:
@@ -158,14 +158,16 @@ def _doubt(track: Track) -> np.ndarray:
 
 
 def weights_of(robot: Robot) -> np.ndarray:
-    """How much the direction of each axis of a robot's pose counts, (A,): the root's first."""
-    model = model_of(robot.xml)
-    number = {body_name(model, body): body for body in range(model.nbody)}
-    carrying = {int(model.body_parentid[number[name]]) for name in robot.limbs}
-    limbs = np.array([_INNER if number[name] in carrying else _OUTER for name in robot.limbs[1:]])
-    limbs *= np.sqrt(_LIMBS / max(np.square(limbs).sum(), 1e-9))
-    axes = (body_of(robot).pose_size - 1) // 2 - len(limbs)  # of the root
-    return np.concatenate([np.full(axes, 1 / np.sqrt(axes)), limbs])
+    """How much each axis and each end of a robot's pose counts, (A + K,): the root's axes first.
+
+    Ends count nothing: directions all but tell where they are.
+    """
+    body = body_of(robot)
+    axes = 1 if body.planar else 3  # of the root
+    limbs = body.weights[axes:]
+    limbs = limbs * np.sqrt(_LIMBS / max(np.square(limbs).sum(), 1e-9))
+    ends = (body.pose_size - 1) // 2 - len(body.weights)
+    return np.concatenate([np.full(axes, 1 / np.sqrt(axes)), limbs, np.zeros(ends)])
 
 
 def _seen(track: Track, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -104,10 +104,13 @@ def import_(
     """
     from onedemo.app.dataset.importer import Export, export_in, import_data
     from onedemo.robots import registry
+    from onedemo.robots.library import copy_robot, robots_in
 
     registry.use(data_dir)
     if source.is_dir():
         given = export_in(source)
+        for _, robot in robots_in(source):
+            copy_robot(robot, data_dir)
     elif segments is None:
         raise UserError("give RATINGS.csv and SEGMENTS.parquet, or the directory of onedemo export --all")
     else:

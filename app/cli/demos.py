@@ -25,7 +25,7 @@ def add(
     video: Path, /, *others: Path, name: str, start: float | None = None, end: float | None = None,
     rotate: str = "0", stabilise: bool = False, crop: str | None = None, track: bool = False,
     mirror: bool = False, speed: str = "1", reverse: bool = False, loop: str | bool = False,
-    fps: float = 30.0, data_dir: DataDir = DATA,
+    fps: float = 30.0, box: str | None = None, data_dir: DataDir = DATA,
 ) -> None:  # fmt: skip
     """Bring in a video.
 
@@ -44,9 +44,13 @@ def add(
         reverse: Play it backwards.
         loop: Repeat it so many times, end to end; without a number as often as fits into 8 s.
         fps: Frames per second to keep.
+        box: What moves is inside this rectangle, if it is not found by itself: X,Y,W,H[@SECONDS], in pixels
+            and seconds of the demo as it is kept.
     """
     from onedemo.demos.edits import read_crop, read_loop, read_rotation, read_speed
     from onedemo.demos.library import import_video
+    from onedemo.vision.mask_file import find_and_keep, hints_of_box, in_words
+    from onedemo.vision.mask_hints import read_box
 
     if others:
         raise UserError(
@@ -57,6 +61,10 @@ def add(
         rectangle = read_crop(crop) if crop is not None else None
     except ValueError as error:
         raise UserError(f"argument --crop: {error}") from None
+    try:
+        marked = read_box(box) if box is not None else None
+    except ValueError as error:
+        raise UserError(f"argument --box: {error}") from None
     demos_dir = data_dir / "demos"
     check_data_dir(demos_dir)
     added = import_video(
@@ -69,6 +77,7 @@ def add(
     print(f"{added.name}: {added.seconds:.1f} s, {added.frames} frames, {added.width}x{added.height}")
     if added.edits:
         print(f"done to the video: {added.edits}")
+    print(f"what moves: {in_words(find_and_keep(added, marked and hints_of_box(added, *marked)))}")
     print(f"learn it with: onedemo serve --demo {added.name} --data-dir {data_dir}")
 
 
@@ -86,8 +95,12 @@ def list_(*, data_dir: DataDir = DATA) -> None:
 def show(name: str, /, *, data_dir: DataDir = DATA) -> None:
     """What is known of a demo."""
     from onedemo.demos.library import find_demo, show
+    from onedemo.vision.mask_file import in_words, kept_masks
 
-    print(show(find_demo(name, data_dir / "demos")))
+    found = find_demo(name, data_dir / "demos")
+    print(show(found))
+    if (masks := kept_masks(found)) is not None:
+        print(f"moves   {in_words(masks)}")
 
 
 @demo.command

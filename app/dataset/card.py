@@ -35,7 +35,8 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         f"Written by onedemo {program_version()}, {when}.\n",
         "## What it is\n\n"
         "People (or programs) saw two short movements side by side: a moment of one demonstration video, and "
-        "something a simulated robot (MuJoCo's Hopper) did. They rated how alike the two are:\n\n"
+        "something a simulated robot did (which one: `env` in the settings). They rated how alike the two "
+        "are:\n\n"
         + "".join(f"- {value}: {answer}\n" for value, answer in enumerate(ANSWERS, 1))
         + "\nThe question was: *How alike are the two movements?* Raters had two practice clips before the "
         "first real one, could skip, take back, and mark where in a clip it goes wrong. The motion comes "

@@ -36,10 +36,10 @@ SEGMENTS: dict[str, str] = {
     "predicted": "What that reward model predicted, 1 to 5.",
     "choice": "Why it was asked.",
     "score": "What it was chosen by.",
-    "obs": "Observations before each step, as Gymnasium's Hopper-v5 has them: (steps, 11).",
-    "actions": "Actions as the policy gave them, not clipped: (steps, 3).",
-    "qpos": "Positions before each step, metres and radians: (steps, 6).",
-    "qvel": "Velocities before each step, metres/s and radians/s: (steps, 6).",
+    "obs": "Observations before each step: positions but for the place on the floor, and velocities.",
+    "actions": "Actions as the policy gave them, not clipped: -1 to 1 is what a motor can do.",
+    "qpos": "Positions before each step, metres and radians, as in the robot's MuJoCo model.",
+    "qvel": "Velocities before each step, metres/s and radians/s, as there.",
 }
 """Of the Parquet file of clips, in order; the last four are lists of rows."""
 

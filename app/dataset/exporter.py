@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Generator
 from itertools import chain
 from pathlib import Path
@@ -11,6 +12,7 @@ from onedemo.app.dataset.csv_writer import csv_blocks
 from onedemo.app.dataset.parquet import write_pairs, write_segments
 from onedemo.core.files import replacing, write_atomic
 from onedemo.demos.library import list_demos
+from onedemo.robots.library import copy_robot, robots_in
 from onedemo.storage.comparisons import COMPARISON_COLUMNS
 from onedemo.storage.rating_records import HISTORY_COLUMNS, RATING_COLUMNS, SKIP_COLUMNS
 from onedemo.storage.store import Store
@@ -26,11 +28,20 @@ not hold any more stays so, and whatever an event is about was there before it."
 def write_export(store: Store, run: str | None, directory: Path) -> None:
     """Writes the files of a whole export, of one run or of all; each is there once it is whole.
 
+    The robots of one's own that the runs are about are copied to ``robots/`` beside them.
+
     Raises:
+        UserError: If one of these robots is damaged.
         OSError: If one cannot be written.
     """
     for name in FILES:
         write_file(store, run, name, directory / name)
+    wanted = {
+        tomllib.loads(entry["config"]).get("env") for entry in store.runs.all() if run in (None, entry["id"])
+    }
+    for name, file in robots_in(store.path.parent):
+        if name in wanted:
+            copy_robot(file, directory)
 
 
 def write_file(store: Store, run: str | None, name: str, file: Path) -> None:

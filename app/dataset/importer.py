@@ -285,5 +285,6 @@ def _widths(run: dict[str, Any], file: Path) -> dict[str, int]:
         robot = robot_named(str(tomllib.loads(run["config"]).get("env", "hopper")))
     except UserError as error:
         raise UserError(f"{file}: run {run['id']}: {error}") from None
-    places = (robot.obs_size + 1) // 2
-    return {"obs": robot.obs_size, "actions": robot.action_size, "qpos": places, "qvel": places}
+    return {
+        "obs": robot.obs_size, "actions": robot.action_size, "qpos": robot.positions, "qvel": robot.velocities
+    }  # fmt: skip

@@ -31,6 +31,15 @@ def assert_nothing_serious(page, where: str) -> None:
     assert not found, (where, found)
 
 
+DIALOGS = {
+    "Start": (("[data-revoke]", ".od-sure[open]"), (".od-account", ".od-menu:popover-open")),
+    "Watch": (("[data-film]", ".od-film[open]"),),
+    "Runs": (("[data-edit-run]", ".od-dialog[open]"),),
+    "Data": ((".od-given >> text=Look", ".od-review[open] [data-frame]"),),
+}
+"""Of a tab: what opens each, and how it is known to be open."""
+
+
 @pytest.mark.parametrize(
     ("viewport", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")], ids=["desktop-light", "phone-dark"]
 )
@@ -72,6 +81,12 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
                 page.click("text=Make links")
                 page.wait_for_selector(".od-links svg", state="attached")
             assert_nothing_serious(page, tab)
+            for opens, shown in DIALOGS.get(tab, ()):
+                page.locator(opens).first.click()
+                page.wait_for_selector(shown)
+                assert_nothing_serious(page, shown)
+                page.keyboard.press("Escape")
+                page.wait_for_selector(shown, state="hidden")
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("s"))
         page.wait_for_selector(".od-notice")

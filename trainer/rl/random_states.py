@@ -8,6 +8,8 @@ Shapes: n states, N lanes, T control steps, q positions, v velocities, a actions
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import mujoco
 import numpy as np
 
@@ -23,6 +25,8 @@ _SUNK = 0.05
 """Metres that a part may reach into the ground: contacts push it out within a few steps."""
 _SLIDE_SPEED, _TURN_SPEED = 2.0, 4.0
 """Standard deviations of velocities where the robot does not say, m/s and rad/s."""
+_TRIED, _SOUND_STEPS, _CALMEST = 32, 5, 0.01
+"""States and control steps by which it is tried whether such velocities can be simulated; the least share."""
 _SLIDE_SECONDS = 0.5
 """A slide goes from one end to the other in no less, within one deviation."""
 
@@ -54,7 +58,7 @@ def random_states(
             qpos[:, of.height] += np.maximum(0, _sunk(of, qpos))
         found.append(qpos)
     qpos = np.concatenate(found)[:count]
-    return qpos, rng.normal(0.0, _speeds(of), (count, of.velocities))
+    return qpos, rng.normal(0.0, _speeds(of) * _calm(of), (count, of.velocities))
 
 
 def _sunk(of: Robot, qpos: np.ndarray) -> np.ndarray:
@@ -97,6 +101,27 @@ def _turned(count: int, rng: np.random.Generator) -> np.ndarray:
     """Rotations of every kind, quaternions (n, 4)."""
     turned = rng.standard_normal((count, 4))
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+
+
+@lru_cache(maxsize=32)
+def _calm(of: Robot) -> float:
+    """Share of the usual velocities at which a robot's physics stays sound: a fish of 10 cm does not race."""
+    if of.wild.speeds is not None:
+        return 1.0
+    rng, lanes = np.random.default_rng(0), np.arange(_TRIED)
+    qpos, spread = _positions(of, _TRIED, rng), rng.normal(0.0, _speeds(of), (_TRIED, of.velocities))
+    env = vector_env.RobotVectorEnv(of, _TRIED, nthread=0)
+    share = 1.0
+    while share > _CALMEST:
+        lost = env.unstable
+        env.set_states(lanes, qpos, share * spread)
+        for _ in range(_SOUND_STEPS):
+            env.step(np.zeros((_TRIED, of.action_size)))
+        if env.unstable - lost <= _TRIED // 10:
+            break
+        share /= 2
+    env.close()
+    return share
 
 
 def _speeds(of: Robot) -> np.ndarray:

@@ -17,7 +17,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from onedemo.errors import UserError
+from onedemo.errors import UserError, in_words
 from onedemo.robots.library import choose
 from onedemo.robots.robot import Robot, model_of
 
@@ -74,7 +74,7 @@ def _environment(number: str) -> gymnasium.Env[Any, Any]:
             "package gymnasium-robotics"
         ) from None
     except Exception as error:  # what an environment needs and does not find, whatever it is
-        raise UserError(f"gymnasium's environment {number} cannot be made: {error}") from None
+        raise UserError(f"gymnasium's environment {number} cannot be made: {in_words(error)}") from None
 
 
 def _same(one: mujoco.MjModel, other: mujoco.MjModel) -> bool:

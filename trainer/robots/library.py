@@ -148,6 +148,32 @@ def load_robot(file: Path) -> Robot:
         raise UserError(f"robot {name} is damaged ({error}): delete {kept} and add it again") from None
 
 
+def copy_robot(file: Path, data_dir: Path) -> None:
+    """Takes a robot of another data directory into this one, unless it is there.
+
+    Args:
+        file: What was chosen for it, as ``robots_in`` gives it; its model is beside it.
+        data_dir: Where to.
+
+    Raises:
+        UserError: If it is damaged, or another robot is called so.
+    """
+    robot = load_robot(file)
+    if (there := own_robot(robot.name, data_dir)) is not None and there.sha256 != robot.sha256:
+        raise UserError(f"there is a robot {robot.name} already, and it is another than {file.parent}")
+    if there is not None:
+        return
+    place, model = data_dir / "robots", file.parent / "model"
+    kept = place / robot.model_sha256
+    make_directory(place, private=True)
+    with Workshop(place, ".robot-") as workshop:
+        if not kept.exists():
+            copy_model(files_of(robot.xml, model), workshop / "model")
+            os.replace(workshop, kept)
+        write_atomic(kept / file.name, file.read_bytes())
+        sync_directory(place)
+
+
 def remove_robot(name: str, data_dir: Path) -> None:
     """Deletes a robot, and its model with the last robot of it.
 

@@ -230,6 +230,11 @@ def clicked(frame: np.ndarray, mask: np.ndarray, clicks: Iterable[Click], index:
     """
     states = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     _mark(states, clicks, index)
+    near = states & 1
+    reach = 0.35 * np.sqrt(max(mask.sum(), 400))
+    away = cv2.distanceTransform(1 - near, cv2.DIST_L2, 3)
+    states[away > reach] = cv2.GC_BGD
+    _mark(states, clicks, index)
     _grab(frame, states, 3)
     return (states & 1).astype(bool)
 

@@ -21,7 +21,7 @@ from onedemo.core.files import read_whole, write_atomic
 from onedemo.demos.library import stream_frames
 from onedemo.errors import UserError
 from onedemo.types import Demo
-from onedemo.vision.mask_hints import Hints
+from onedemo.vision.mask_hints import Box, Hints, check_hints
 from onedemo.vision.masks import LENGTH, METHODS, SURE, Masks, find_masks
 
 FILE_NAME = "masks.npz"
@@ -87,6 +87,50 @@ def masks_of(demo: Demo, length: float = LENGTH) -> Masks:
         UserError: If the stored video is missing or damaged.
     """
     return (kept_masks(demo) or find_mover(demo)).of_length(length)
+
+
+def find_and_keep(demo: Demo, hints: Hints | None = None) -> Masks:
+    """Finds the mover of a demo of the library and keeps it there; without hints, unless that was done.
+
+    Raises:
+        UserError: If the stored video is missing or damaged, the disk is full, or nothing is where somebody
+            has marked it; what was kept before then stays.
+    """
+    if not hints and (kept := kept_masks(demo)) is not None:
+        return kept
+    masks = find_mover(demo, hints)
+    if hints:
+        check_found(masks)
+    try:
+        write_masks(mask_file(demo), masks, hints)
+    except OSError as error:
+        raise UserError(f"what moves could not be stored beside {demo.path}: {error.strerror}") from error
+    return masks
+
+
+def hints_of_box(demo: Demo, box: tuple[float, float, float, float], seconds: float) -> Hints:
+    """A box that somebody has typed.
+
+    Args:
+        demo: The demo, in whose pixels it is.
+        box: x, y, width, height.
+        seconds: The moment in the demo.
+
+    Raises:
+        UserError: If it lies outside the demo.
+    """
+    if seconds >= demo.seconds:
+        raise UserError(
+            f"argument --box: {seconds:g} s is past the end of the demo, which lasts {demo.seconds:.2f} s"
+        )
+    x, y, width, height = box
+    frame = min(demo.frames - 1, int(seconds * demo.fps + 1e-6))
+    hints = Hints(box=Box(frame=frame, x=x, y=y, width=width, height=height))
+    try:
+        check_hints(hints, demo.frames, (demo.width, demo.height))
+    except ValueError as error:
+        raise UserError(f"argument --box: {error}") from None
+    return hints
 
 
 def kept_masks(demo: Demo) -> Masks | None:

@@ -32,8 +32,8 @@ SURE = 0.5
 """Doubt below which a mask is taken to be right."""
 _LONGEST = 95
 """Percentile of the masks' diagonals that is the mover stretched out."""
-_TOUCHES = 45
-"""Pictures within which a mover comes down, if it ever does."""
+_TOUCHES = 75
+"""Percentile of the masks' lower edges that is the floor of a camera that goes: what shines shows more."""
 _OWN = 1.0
 """Logarithm of the odds from which on a colour is the mover's own."""
 _CHANGED = 0.15
@@ -280,23 +280,9 @@ def _ground(masks: np.ndarray, motion: Motion | None) -> tuple[np.ndarray, np.nd
     first = np.nanpercentile(bottom, 80)
     floor, gone = _carried(motion, middle, first)
     for _ in range(8):  # where the floor is first, so that the mover reaches it and does not sink in
-        first += float(np.nanpercentile(bottom - floor, _LONGEST))
+        first += float(np.nanpercentile(bottom - floor, _TOUCHES))
         floor, gone = _carried(motion, middle, first)
-    return floor + _settled(bottom - floor, 0.06 * longest(masks)), -gone
-
-
-def _settled(above: np.ndarray, most: float) -> np.ndarray:
-    """What a floor that was carried from picture to picture is off by, (F,): a mover touches it now and then.
-
-    Args:
-        above: How far the mover is below it, (F,), pixels; nan where it is not seen.
-        most: By which it is moved at most.
-    """
-    padded = np.pad(above, _TOUCHES // 2, constant_values=np.nan)
-    around = np.lib.stride_tricks.sliding_window_view(padded, _TOUCHES)
-    return cv2.blur(np.clip(np.nan_to_num(np.nanmax(around, axis=1)), -most, most)[:, None], (1, _TOUCHES))[
-        :, 0
-    ]
+    return floor, -gone
 
 
 def _carried(motion: Motion, columns: np.ndarray, row: float) -> tuple[np.ndarray, np.ndarray]:
@@ -326,7 +312,7 @@ def _doubt(masks: np.ndarray, others: np.ndarray, apart: float, method: str) -> 
     area = masks.sum(axis=(1, 2)).astype(float)
     doubts = [
         np.clip((_jump(area) - 0.2) / 0.5, 0, 1),
-        np.clip((_changed(masks) - 0.35) / 0.4, 0, 1),
+        np.clip((_changed(masks) - 0.25) / 0.4, 0, 1),
         np.where(_at_border(masks), 0.6, 0.0),
         np.clip(others - 0.1, 0, 0.8),
         np.full(len(masks), {"studio": 0.0, "colour": 0.35}.get(method, 0.05)),
@@ -348,18 +334,19 @@ def _jump(area: np.ndarray) -> np.ndarray:
 
 
 def _changed(masks: np.ndarray) -> np.ndarray:
-    """Which share of a mask, brought over the one before, lies outside it, (F,)."""
+    """Which share of a mask lies beside the one before, brought over it, (F,); limbs may turn a little."""
     changed = np.zeros(len(masks))
+    reach = max(3, round(0.12 * longest(masks))) | 1
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     centres = [np.argwhere(mask).mean(axis=0) if mask.any() else None for mask in masks]
     for index in range(1, len(masks)):
         before, here = centres[index - 1], centres[index]
         if before is None or here is None:
             continue
         y, x = np.round(here - before).astype(int)
-        moved = np.roll(masks[index - 1], (y, x), (0, 1))
-        both, either = (moved & masks[index]).sum(), (moved | masks[index]).sum()
-        changed[index] = 1 - both / either
-    return np.maximum(changed, np.append(changed[1:], 0)) if len(masks) > 1 else changed
+        moved = cv2.dilate(np.roll(masks[index - 1], (y, x), (0, 1)).astype(np.uint8), around)
+        changed[index] = (masks[index] & (moved == 0)).sum() / masks[index].sum()
+    return changed
 
 
 def _at_border(masks: np.ndarray) -> np.ndarray:

@@ -11,8 +11,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from helpers import warm
 from helpers.paths import ROOT
 from helpers.server_process import Serving
+from load import serving as real
 from load.serving import FEW_STATES
 from onedemo.app.cli.main import _app, main
 from onedemo.config import METHODS, RunConfig, describe, to_toml
@@ -48,6 +50,16 @@ from onedemo.storage.store import Store
         ("demo remove nope", "no demo called 'nope'"),
         ("demo remove hopper-hop", "comes with the program: it can be neither removed nor renamed"),
         ("demo rename hopper-hop x", "comes with the program"),
+        ("robot add nowhere.xml --name x", "there is no model nowhere.xml"),
+        ("robot add nowhere.xml --name ant", "ant comes with the program; choose another name"),
+        ("robot add nowhere.xml --name x --root loose", "--root: invalid choice: 'loose'"),
+        ("robot show nope", "unknown robot 'nope'; choose one of: ant, half-cheetah, hopper"),
+        ("robot show gym:CartPole-v1", "does not say which MuJoCo model it has"),
+        ("robot render hopper x.gif", "the picture must end in .png or .jpg, got x.gif"),
+        ("robot render hopper x.png --count 0", "--count must be 1 to 60, got 0"),
+        ("robot remove hopper", "there is no robot hopper of your own"),
+        ("serve --robot nope", "unknown robot 'nope'"),
+        ("train --robot walker2d", "demo hopper-backflip was made with robot hopper, and walker2d cannot"),
         ("rater revoke Nobody", "no onedemo.sqlite3 in"),
         ("export", "no onedemo.sqlite3 in"),
         ("rater list", "no onedemo.sqlite3 in"),
@@ -228,7 +240,9 @@ def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(servin
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    serving.begin = real.command  # as a person starts it, this once
     child, links, _ = serving.start("--port", str(port), *FEW)
+    serving.begin = warm.begin
     assert list(links) == ["researcher", "annotator"]
     assert all(link.startswith(f"http://127.0.0.1:{port}/login?token=") for link in links.values())
     second, none, log = serving.start("--port", str(port))

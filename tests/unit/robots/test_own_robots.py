@@ -2,10 +2,13 @@
 
 import json
 import shutil
+from typing import ClassVar
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from gymnasium.envs.mujoco import MujocoEnv
 
 from helpers.paths import ROOT
 from onedemo.errors import UserError
@@ -292,3 +295,22 @@ def test_environments_of_gymnasium_are_robots_by_their_number(number):
 def test_environments_that_are_no_robots(number, said):
     with pytest.raises(UserError, match=said):
         registry.robot_named(f"gym:{number}")
+
+
+def test_an_environment_that_something_else_than_motors_moves():
+    """As the Fetch robots, whose gripper is drawn to a place in the world."""
+
+    class Drawn(MujocoEnv):
+        metadata: ClassVar = {"render_modes": ["human", "rgb_array", "depth_array", "rgbd_tuple"]}
+
+        def __init__(self, **_):
+            space = gymnasium.spaces.Box(-1, 1, (3,))
+            super().__init__(str(MODELS / "arm.xml"), 5, space, width=64, height=64)
+            self.action_space = gymnasium.spaces.Box(-1, 1, (4,))
+
+    gymnasium.register("Drawn-v0", entry_point=lambda **options: Drawn(**options))
+    try:
+        with pytest.raises(UserError, match=r"gym:Drawn-v0 takes actions \(4,\) where its model has 3 act"):
+            registry.robot_named("gym:Drawn-v0")
+    finally:
+        del gymnasium.registry["Drawn-v0"]
