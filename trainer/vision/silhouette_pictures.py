@@ -105,10 +105,8 @@ def swaps_of(robot: Robot) -> np.ndarray:
 
 def _branch(model: mujoco.MjModel, body: int) -> list[int]:
     """A body and all that hang on it."""
-    return [
-        body,
-        *(b for child in np.flatnonzero(model.body_parentid == body) for b in _branch(model, child)),
-    ]
+    children = np.flatnonzero(model.body_parentid == body).tolist()
+    return [body, *(each for child in children for each in _branch(model, child))]
 
 
 def _alike(model: mujoco.MjModel, robot: Robot, one: int, other: int) -> bool:
