@@ -44,7 +44,7 @@ from onedemo.types import Clip, Demo, Rollouts
 from onedemo.vision import silhouette
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.mask_file import masks_of
-from onedemo.vision.pose_estimator import Track, shipped_track
+from onedemo.vision.pose_estimator import Track
 from onedemo.vision.silhouette import Silhouette
 
 _TIDY_S = 10.0
@@ -189,7 +189,7 @@ class TrainingRun:
         features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
         if not self.config.predictor.appearance:
             return features, None
-        if (track := shipped_track(self.demo)) is not None:
+        if (track := silhouette.known_track(self.demo, self.config.env)) is not None:
             return features, track
         began = time.monotonic()
 

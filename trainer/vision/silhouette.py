@@ -139,8 +139,9 @@ class Silhouette:
         stands = np.isfinite(found.floor).any()
         return Track(
             pose=pose.astype(np.float32), motion=motion.astype(np.float32),
-            travel=None if found.way is None else np.float32(at[:, -2] / TRAVEL_SCALE),
-            contact=np.float32(np.clip(at[:, -1], 0, 1)) if stands else None, doubt=doubt.astype(np.float32),
+            travel=None if found.way is None else (at[:, -2] / TRAVEL_SCALE).astype(np.float32),
+            contact=np.clip(at[:, -1], 0, 1).astype(np.float32) if stands else None,
+            doubt=doubt.astype(np.float32),
         )  # fmt: skip
 
     @property
@@ -165,10 +166,15 @@ def seen_in(
     Raises:
         UserError: If the stored video is missing or damaged, or this machine cannot draw.
     """
-    if (track := shipped_track(demo)) is not None:
+    if (track := known_track(demo, env_name)) is not None:
         return track
     learned = learn(env_name, cache_dir, check)
     return learned.track(masks_of(demo, learned.reach), demo.fps)
+
+
+def known_track(demo: Demo, env_name: str) -> Track | None:
+    """What a built-in demo of a robot shows, as it is kept beside its video; None for any other."""
+    return shipped_track(demo) if demo.robot == env_name else None
 
 
 def file_name(env_name: str) -> str:

@@ -105,10 +105,8 @@ def swaps_of(robot: Robot) -> np.ndarray:
 
 def _branch(model: mujoco.MjModel, body: int) -> list[int]:
     """A body and all that hang on it."""
-    return [
-        body,
-        *(b for child in np.flatnonzero(model.body_parentid == body) for b in _branch(model, child)),
-    ]
+    children = np.flatnonzero(model.body_parentid == body).tolist()
+    return [body, *(each for child in children for each in _branch(model, child))]
 
 
 def _alike(model: mujoco.MjModel, robot: Robot, one: int, other: int) -> bool:
@@ -122,7 +120,7 @@ def _alike(model: mujoco.MjModel, robot: Robot, one: int, other: int) -> bool:
             model.body_pos[a, plane], model.body_pos[b, plane], atol=0.01
         ):
             return False
-        for sizes in (model.geom_size, model.geom_pos[:, plane], np.float64(model.geom_type)[:, None]):
+        for sizes in (model.geom_size, model.geom_pos[:, plane], model.geom_type[:, None]):
             if not np.allclose(sizes[geoms[0]], sizes[geoms[1]], atol=0.01):
                 return False
     return True

@@ -1,5 +1,6 @@
 """The exam of the pose estimator: looks, codecs, scores, and a job in its smallest form."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -7,7 +8,6 @@ from onedemo.errors import UserError
 from onedemo.experiments.jobs import pose
 from onedemo.experiments.jobs.pose_looks import FAULTS, LOOKS, blurred, coded
 from onedemo.experiments.report import document
-from onedemo.experiments.report.account import complete
 from onedemo.experiments.runner import Outcome
 from onedemo.experiments.tables import pose as table
 from onedemo.robots.registry import robot_named
@@ -38,26 +38,24 @@ def test_a_slow_shutter_mixes_a_frame_with_the_next():
     assert np.abs(soft[-1].astype(int) - frames()[-1]).mean() < 3
 
 
-def test_lossless_video_comes_back_in_order():
-    again = coded(frames(), "libx264rgb", {"crf": "0"})
-    assert np.abs(again.astype(int) - frames()).mean() < 3
+def test_a_good_video_comes_back_in_order():
+    again = coded(frames(), "libx264", {"crf": "1"})
+    assert np.abs(again.astype(int) - frames()).mean() < 5
 
 
 @pytest.mark.seam
 @pytest.mark.parametrize("look", LOOKS)
 def test_the_camera_of_a_look_is_the_one_that_masks_are_drawn_for(look):
-    """What differs from a drawing without the robot lies where the true mask is."""
+    """The robot's strong colours lie where the true mask is, and hardly anywhere else."""
     robot, where = robot_named("hopper"), LOOKS[look]
-    qpos = np.tile([0.0, 1.25, 0.0, -0.3, -0.5, 0.3], (2, 1))
-    away = qpos + np.array([0.0, 30.0, 0, 0, 0, 0])
-    shown, empty = where.draw(robot, qpos), where.draw(robot, away)
-    assert shown.shape[1:3] == where.size[::-1]
-    truth = pose.true_masks(robot, where, qpos)
-    rows, columns = np.nonzero(np.abs(shown[0].astype(int) - empty[0]).max(axis=2) > 60)
-    by = 240 / shown.shape[1]
-    right = np.argwhere(truth.masks[0])
-    middle = np.median(rows) * by, (np.median(columns) - shown.shape[2] / 2) * by + 120
-    assert np.abs(np.median(right, axis=0) - middle).max() < 12
+    qpos = np.array([[0.7, 1.3, 0.3, -0.3, -0.5, 0.3]])
+    (shown,), (mask,) = where.draw(robot, qpos), pose.true_masks(robot, where, qpos).masks
+    assert shown.shape[:2] == where.size[::-1]
+    width = round(240 * shown.shape[1] / shown.shape[0])
+    middle = cv2.resize(shown, (width, 240), interpolation=cv2.INTER_AREA)[:, width // 2 - 120 :][:, :240]
+    strong = cv2.cvtColor(middle, cv2.COLOR_RGB2HSV)[..., 1] > 105
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert strong[mask].mean() > 0.8 and (strong & near).sum() > 0.6 * strong.sum()
 
 
 def test_scores_of_a_perfect_reader_are_one():
@@ -77,16 +75,16 @@ def test_scores_of_a_perfect_reader_are_one():
 
 @pytest.mark.seam
 @pytest.mark.slow
-def test_a_job_from_its_films_to_the_report(tmp_path):
-    """With the net that comes with the program, one short film and parts of the demos."""
-    job = table.plan((101,), quick=True)[0]
+def test_a_job_from_its_films_to_the_report(tmp_path, monkeypatch):
+    """With the net that comes with the program, and one short film."""
+    monkeypatch.setattr(pose, "built_in", list)
+    job = next(job for job in table.plan((101,), quick=True) if "mjviser" in job.label)
     result = document.plain(pose.run({**job.settings, "films": 1, "seconds": 1.0}, 101, tmp_path))
     assert tuple(result) == pose.HOW
+    assert all(0 <= scores["iou"] <= 1 and len(scores["explained"]) == 20 for scores in result.values())
     explained = result[pose.TRUE]["explained"]
     assert np.mean([explained[f"{way} of torso"] for way in ("right", "up")]) > 0.7
-    report = table.TABLE.report([Outcome(job=job, kept={"result": result})], quick=True)
-    text = document.as_text(complete(report, [Outcome(job=job, kept={"result": result, "machine": {}})],
-                                     command="onedemo bench pose", quick=True))  # fmt: skip
+    text = document.as_text(table.TABLE.report([Outcome(job=job, kept={"result": result})], quick=True))
     assert "true masks" in text and "directions at least 0.9" in text
 
 

@@ -294,6 +294,21 @@ def test_a_built_in_demo_is_known_without_a_look_at_the_robot(tmp_path):
     np.testing.assert_array_equal(track.pose, shipped_track(demo).pose)
 
 
+def test_what_ships_beside_a_demo_is_of_the_robot_that_made_it(tmp_path, monkeypatch):
+    """Another robot has other limbs, or as many numbers of other limbs."""
+    demo, asked = find_demo("hopper-hop", tmp_path / "demos"), []
+
+    class Shapes:
+        reach = 1.6
+
+        def track(self, found, fps):
+            return None
+
+    monkeypatch.setattr(silhouette, "learn", lambda name, *_: asked.append(name) or Shapes())
+    assert silhouette.seen_in(demo, "hopper", tmp_path) is not None and not asked
+    assert silhouette.seen_in(demo, "walker2d", tmp_path) is None and asked == ["walker2d"]
+
+
 def test_a_known_robot_is_read_at_once_from_a_small_file(tmp_path):
     """No picture is drawn and nothing is fitted at the first start with a new data directory."""
     file = learned_robots.SHIPPED / f"{silhouette.file_name('hopper')}.npz"
