@@ -124,9 +124,13 @@ def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
         return None
     way = np.unwrap(place, period=2) * camera.unit
+    # The colours of head and foot say so where all is in one plane; the squares of the floor tell the way
+    # where the camera keeps its distance from them.
+    flat, straight = robot.root == "planar" and camera.up == 2, robot.root != "free"
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
-        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot), way=way - way[0],
+        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)) if flat else None,
+        foot=_filled(foot) if flat else None, way=way - way[0] if straight else None,
         outlines=tuple(outlines),
     )  # fmt: skip
 
