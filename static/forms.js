@@ -216,7 +216,7 @@
     const shown = demos.selectedOptions[0]?.dataset.of;
     if (event.target === demos && shown && [...robot.options].some((o) => o.value === shown)) robot.value = shown;
     for (const option of demos.options) option.disabled = Boolean(option.dataset.of) && option.dataset.of !== robot.value;
-    if (demos.selectedOptions[0]?.disabled) demos.value = [...demos.options].find((o) => !o.disabled)?.value ?? "";
+    if (demos.selectedOptions[0]?.disabled) demos.value = [...demos.options].find((o) => o.value && !o.disabled)?.value ?? "";
   });
 
   // The sentence at a field; none if it is empty.

@@ -22,6 +22,7 @@ from onedemo.app.tabs import charts, progress
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.errors import UserError
+from onedemo.render.stage import beside
 from onedemo.render.studio import colours_of
 from onedemo.robots.camera import Camera, visible_geoms
 from onedemo.robots.robot import Robot
@@ -275,6 +276,8 @@ def drawn_model(robot: Robot) -> mujoco.MjModel:
     seen = visible_geoms(model)
     seen = seen[~floor[seen]]
     colours = colours_of(robot, model)
+    if (apart := beside(robot, model)) is not None:
+        model.geom_pos += apart
     model.geom_matid[:], model.geom_rgba[:, 3] = -1, 0
     model.geom_group[seen], model.site_group[:] = 0, 5
     for geom in seen:

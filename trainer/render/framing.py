@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -229,6 +230,8 @@ class _Track:
     """A robot's way through a clip."""
 
     qpos: np.ndarray
+    points: dict[str, np.ndarray]
+    """The ends of its limbs, as ``Body.points``."""
     low: np.ndarray
     """The least x and z that it reaches, (k, 2)."""
     high: np.ndarray
@@ -241,20 +244,16 @@ class _Track:
     @staticmethod
     def of(renderer: Renderer, qpos: np.ndarray) -> _Track:
         camera = renderer.robot.camera
-        if not camera.follows:
+        points = body_of(renderer.robot).points(qpos)
+        if camera.follows:  # the mean of its limbs: steadier than the edges of what it reaches
+            aim = np.mean(list(points.values()), axis=(0, 2))
+        else:
             aim = np.full((len(qpos), 2), (camera.middle, camera.height))
-        else:  # the mean of its limbs: steadier than the edges of what it reaches
-            ends = np.stack(list(body_of(renderer.robot).points(qpos).values()))
-            aim = ends.mean(axis=(0, 2))
         above = camera.up != 2
         # As large as it is seen in the plane that the view has the scale of.
         eyes = aim if above else np.stack([aim[:, 0], np.full(len(qpos), camera.height)], axis=1)
-        edges = [
-            _seen_at(shape, eye, camera.distance)
-            for shape, eye in zip(renderer.shapes(qpos), eyes, strict=True)
-        ]
-        low, high = (np.stack(some) for some in zip(*edges, strict=True))
-        return _Track(qpos, low, high, aim[:, 0], aim[:, 1] if above else None)
+        low, high = _seen_at(renderer.shapes(qpos), eyes, camera.distance)
+        return _Track(qpos, points, low, high, aim[:, 0], aim[:, 1] if above else None)
 
     @property
     def extent(self) -> Extent:
@@ -267,12 +266,13 @@ class _Track:
 
 
 def _seen_at(shape: Shape, eye: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the most x and z, (2,) each, that a camera at ``eye`` sees parts at."""
-    scales = [
-        distance / np.maximum(distance + depth[:, 1:2], 0.1 * distance) for depth in (shape.low, shape.high)
-    ]
-    ends = [eye + (side[:, (0, 2)] - eye) * scale for side in (shape.low, shape.high) for scale in scales]
-    return np.min(ends, axis=(0, 1)), np.max(ends, axis=(0, 1))
+    """The least and the most x and z, (k, 2) each, that cameras at ``eye``, (k, 2), see parts at."""
+    eye = eye[:, None]
+    sides = [side[..., ::2] - eye for side in (shape.low, shape.high)]
+    near, far = (np.maximum(distance + side[..., 1:2], 0.1 * distance) for side in (shape.low, shape.high))
+    low = np.minimum(sides[0] / near, sides[0] / far).min(axis=1)
+    high = np.maximum(sides[1] / near, sides[1] / far).max(axis=1)
+    return eye[:, 0] + distance * low, eye[:, 0] + distance * high
 
 
 def _drawn(renderer: Renderer, track: _Track, view: View) -> Side:
@@ -282,7 +282,7 @@ def _drawn(renderer: Renderer, track: _Track, view: View) -> Side:
     )
     known = {
         "width": round(view.width, 4), "left": _numbers(middle - view.width / 2),
-        "marks": [[word, _numbers(path)] for word, path in marks(renderer.robot, track.qpos)],
+        "marks": [[word, _numbers(path)] for word, path in marks(renderer.robot, track.points)],
         "ghost": _numbers(renderer.outline(track.qpos[0])),
     }  # fmt: skip
     if track.rise is None:
@@ -297,7 +297,7 @@ def _measures(camera: Camera) -> dict[str, Any]:
     return {"camera": [camera.height, camera.distance], "unit": camera.unit}
 
 
-def marks(robot: Robot, qpos: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def marks(robot: Robot, points: dict[str, np.ndarray]) -> list[tuple[str, np.ndarray]]:
     """The paths that are drawn through a clip, with a word for each that is named.
 
     Of a robot that moves about these are its head, the end of its root that is higher at rest, or that is in
@@ -305,29 +305,36 @@ def marks(robot: Robot, qpos: np.ndarray) -> list[tuple[str, np.ndarray]]:
 
     Args:
         robot: The robot.
-        qpos: Positions, (k, q).
+        points: The ends of its limbs, as ``Body.points``, (k, 2, 2) each.
 
     Returns:
         Of each its word, "" for further feet, and its places, (k, 2): to the right and above the floor.
     """
-    body, camera = body_of(robot), robot.camera
-    rest = body.points(model_of(robot.xml).qpos0)
-    now = body.points(qpos)
-    ground = np.array([0.0, camera.floor if camera.up == 2 else 0.0])
+    ground = np.array([0.0, robot.camera.floor if robot.camera.up == 2 else 0.0])
+    return [
+        (word, (points[limb].mean(axis=-2) if end is None else points[limb][..., end, :]) - ground)
+        for word, limb, end in _marked(robot)
+    ]
+
+
+@lru_cache(32)
+def _marked(robot: Robot) -> list[tuple[str, str, int | None]]:
+    """Of each mark its word, its limb, and which end of that, or None for its middle."""
+    above = robot.camera.up != 2
+    rest = body_of(robot).points(model_of(robot.xml).qpos0)
     root = robot.limbs[0]
     if robot.root == "fixed":
         begin = rest[root].mean(axis=0)
         far = max(robot.limbs, key=lambda name: np.linalg.norm(rest[name] - begin, axis=1).max())
-        end = int(np.linalg.norm(rest[far] - begin, axis=1).argmax())
-        return [("Tip", now[far][..., end, :] - ground)]
-    top = int(rest[root][:, 1 if camera.up == 2 else 0].argmax())
-    found = [("Head", now[root][..., top, :] - ground)]
+        return [("Tip", far, int(np.linalg.norm(rest[far] - begin, axis=1).argmax()))]
+    found: list[tuple[str, str, int | None]] = [
+        ("Head", root, int(rest[root][:, 0 if above else 1].argmax()))
+    ]
     for number, name in enumerate(_feet(robot, rest)):
         rise = abs(rest[name][1, 1] - rest[name][0, 1])
         upright = rise > 0.5 * np.linalg.norm(rest[name][1] - rest[name][0])
-        # Of what stands upright, its lower end; else its middle.
-        place = now[name][..., int(rest[name][:, 1].argmin()), :] if upright else now[name].mean(axis=-2)
-        found.append(("" if number else "Foot" if camera.up == 2 else "Tail", place - ground))
+        end = int(rest[name][:, 1].argmin()) if upright else None  # its lower end, if it has one
+        found.append(("" if number else "Tail" if above else "Foot", name, end))
     return found
 
 

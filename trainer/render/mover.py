@@ -117,10 +117,14 @@ def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     top = height - (camera.height + free_above(camera) - 0.03 * camera.size - view.bottom) * view.scale
     if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
         return None
+    # The colours of head and foot say so where all is in one plane; the squares of the floor tell the way
+    # where the camera keeps its distance from them.
+    flat, straight = robot.root == "planar" and camera.up == 2, robot.root != "free"
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
-        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot),
-        way=way_in_studio(frames, solids, camera), outlines=tuple(outlines),
+        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)) if flat else None,
+        foot=_filled(foot) if flat else None,
+        way=way_in_studio(frames, solids, camera) if straight else None, outlines=tuple(outlines),
     )  # fmt: skip
 
 

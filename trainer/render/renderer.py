@@ -170,17 +170,13 @@ class Renderer:
             self._draw(image, eye, window, shape, by=_CLOSE_SCALE, exact=False)
         return images
 
-    def shapes(self, qpos_kq: np.ndarray) -> list[Shape]:
-        """How far the robot's geoms reach at each of some positions, (k, q).
+    def shapes(self, qpos_kq: np.ndarray) -> Shape:
+        """How far the robot's L geoms reach at each of some positions, (k, q): (k, L, 3) each.
 
         Places away from the camera are counted from the plane that it is ``Camera.distance`` before.
         """
-        found = []
-        for qpos in np.asarray(qpos_kq, np.float64):
-            shape = self._stage.pose(self._data, qpos)
-            plane = np.array([0.0, self._stage.eye(self._data, shape).y, 0.0])
-            found.append(Shape(shape.low - plane, shape.high - plane))
-        return found
+        found = [self._stage.reach(self._data, qpos) for qpos in np.asarray(qpos_kq, np.float64)]
+        return Shape(np.stack([shape.low for shape in found]), np.stack([shape.high for shape in found]))
 
     def outline(self, qpos: np.ndarray) -> np.ndarray:
         """The border of the robot at some positions, (q,): right and above the floor, metres, (n, 2)."""

@@ -30,9 +30,9 @@ class Shape:
     """How far each geom reaches."""
 
     low: np.ndarray
-    """(L, 3)."""
+    """(..., L, 3)."""
     high: np.ndarray
-    """(L, 3)."""
+    """(..., L, 3)."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -69,10 +69,11 @@ class Stage:
         self._root = int(model.body_rootid[limbs[0]]) if limbs.size else 0
         self._extents = Extents(model, seen)
         self._silhouette = Silhouette(model, seen[self._limbs], self._axes[[0, 2]], camera.size)
+        self._depth = float(self._axes[1].sum()) * camera.depth
         self._free = robot.root == "free"
         self._above = camera.up != 2
         self._free_above = free_above(camera)
-        self._beside = _beside(robot, model)
+        self._beside = beside(robot, model)
 
     def pose(self, data: mujoco.MjData, qpos: np.ndarray) -> Shape:
         """Moves the robot, and tells how far it reaches now.
@@ -89,10 +90,23 @@ class Stage:
             data.geom_xpos += self._beside
         return self._seen(*self._extents.of(data))
 
+    def reach(self, data: mujoco.MjData, qpos: np.ndarray) -> Shape:
+        """As ``pose``, but away from the camera from the plane that it is ``Camera.distance`` before."""
+        if self._free:
+            shape = self.pose(data, qpos)
+            y = self.eye(data, shape).y
+        else:  # which needs neither centres of mass nor lights
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(self._model, data)
+            shape, y = self._seen(*self._extents.of(data)), self._depth
+        shape.low[:, 1] -= y
+        shape.high[:, 1] -= y
+        return shape
+
     def eye(self, data: mujoco.MjData, shape: Shape) -> Eye:
         """From where the robot, just posed, is seen whole."""
         camera = self._camera
-        x, y, z = camera.middle, float(self._axes[1].sum()) * camera.depth, camera.height
+        x, y, z = camera.middle, self._depth, camera.height
         if camera.follows:
             middle = data.subtree_com[self._root]
             x = float(middle[camera.right])
@@ -145,7 +159,7 @@ def free_above(camera: Camera) -> float:
     return round(_FREE_ABOVE * half / camera.unit, 2) * camera.unit
 
 
-def _beside(robot: Robot, model: mujoco.MjModel) -> np.ndarray | None:
+def beside(robot: Robot, model: mujoco.MjModel) -> np.ndarray | None:
     """By how much each geom is moved toward the camera or away from it, (geoms, 3); None if none is."""
     if robot.root != "planar":
         return None

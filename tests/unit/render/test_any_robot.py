@@ -19,6 +19,7 @@ from onedemo.render.studio import chains, colours_of, studio_model
 from onedemo.robots.camera import Camera, Extents, chosen_camera, visible_geoms
 from onedemo.robots.registry import BUILT_IN, robot_named
 from onedemo.robots.robot import build, model_of, root_of
+from onedemo.sim.kinematics import body_of
 from onedemo.sim.vector_env import RobotVectorEnv
 from onedemo.training.pictures import draw_clip, draw_strip
 
@@ -40,6 +41,11 @@ def limbs(picture):
     solid = picture.max(axis=2).astype(int) - picture.min(axis=2) > 60
     rows, columns = np.nonzero(solid)
     return np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]), solid
+
+
+def marked(robot):
+    """Words and places of its marks at rest."""
+    return marks(robot, body_of(robot).points(rest(robot)))
 
 
 def moves(robot, count, seed=0):
@@ -213,13 +219,13 @@ def test_a_clip_shows_the_whole_robot_with_its_marks_on_it(robot, tmp_path):
 
 
 def test_what_is_marked_of_each_robot():
-    words = {robot.name: [word for word, _ in marks(robot, rest(robot))] for robot in ROBOTS}
+    words = {robot.name: [word for word, _ in marked(robot)] for robot in ROBOTS}
     assert words == {
         "hopper": ["Head", "Foot"], "walker2d": ["Head", "Foot", ""], "half-cheetah": ["Head", "Foot", ""],
         "humanoid": ["Head", "Foot", ""], "ant": ["Head", "Foot", "", "", ""], "swimmer": ["Head", "Tail"],
         "arm": ["Tip"],
     }  # fmt: skip
-    head, *feet = (place[0] for _, place in marks(robot_named("walker2d"), rest(robot_named("walker2d"))))
+    head, *feet = (place[0] for _, place in marked(robot_named("walker2d")))
     assert head[1] > 1.2 and all(foot[1] < 0.2 for foot in feet)
 
 
