@@ -14,10 +14,10 @@ from pathlib import Path
 from onedemo.core.names import check_name
 from onedemo.core.outputs import check_outputs
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, load_hidden, save_hidden
-from onedemo.demos.library import BUILT_IN, render_demo, show
+from onedemo.demos.library import BUILT_IN, read_frames, render_demo, show
 from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.vision.mask_file import masks_of
-from onedemo.vision.pose_estimator import keep_track
+from onedemo.vision.pose_estimator import keep_track, with_ground
 from onedemo.vision.silhouette import learn
 
 
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
         learned = learn(robot.name, asked.cache / "robots")
         track = learned.track(masks_of(demo, learned.reach), demo.fps)
         assert track is not None, "it shows the robot"
-        keep_track(demo, track)
+        keep_track(demo, with_ground(track, read_frames(demo), demo.fps, robot))
 
 
 def cut(hidden: HiddenStates, steps: int) -> HiddenStates:

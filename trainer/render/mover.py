@@ -23,6 +23,7 @@ from onedemo.render.studio import LIMB_COLOURS
 from onedemo.robots.camera import Camera
 from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.robots.robot import Robot
+from onedemo.sim.kinematics import CONTACT_REACH
 
 _CALM = 4.0  # pictures over which a view's way is smoothed
 _MOST = 0.15  # of a picture: what differs from the median when one body moves
@@ -47,6 +48,8 @@ class Mover:
     """Column and row in each picture, (F, 2); None where parts cannot be told."""
     foot: np.ndarray | None = None
     """The same."""
+    root: np.ndarray | None = None
+    """The same of the middle of the limb that the others hang at."""
     way: np.ndarray | None = None
     """Metres that the camera has gone along the track, (F,); None where floor and sizes are guessed."""
     outlines: tuple[np.ndarray, ...]
@@ -56,7 +59,7 @@ class Mover:
         """Of some of the pictures, (k,)."""
         tracks = {
             name: track if track is None else track[frames]
-            for name in ("box", "aim", "head", "foot", "way")
+            for name in ("box", "aim", "head", "foot", "root", "way")
             for track in [getattr(self, name)]
         }
         return replace(self, **tracks, outlines=tuple(self.outlines[frame] for frame in frames))
@@ -74,6 +77,30 @@ def locate(frames: np.ndarray, robot: Robot | None = None) -> Mover | None:
     """
     robot = robot or robot_named(DEFAULT)
     return _in_studio(frames, robot) if is_studio(frames) else _before_background(frames, robot)
+
+
+def travel_of(mover: Mover, fps: float) -> np.ndarray | None:
+    """Velocity of the root to the right: how the camera goes and how the root moves in its pictures.
+
+    Args:
+        mover: Where it is in F pictures.
+        fps: Pictures per second.
+
+    Returns:
+        m/s, (F,), smoothed over a picture before and after; None where the camera's way is not known.
+    """
+    if mover.way is None or mover.root is None or len(mover.way) < 2:
+        return None
+    speed = fps * np.gradient(mover.way + (mover.root[:, 0] - mover.aim) / mover.scale)
+    return np.convolve(np.pad(speed, 1, "edge"), (0.25, 0.5, 0.25), "valid")
+
+
+def contact_of(mover: Mover) -> np.ndarray | None:
+    """How far the lowest part touches the ground, 0..1, (F,); None where the floor is guessed."""
+    if mover.way is None:
+        return None
+    lowest = (mover.floor - mover.box[:, 3]) / mover.scale
+    return np.clip(1 - lowest / CONTACT_REACH, 0, 1)
 
 
 def is_studio(frames: np.ndarray) -> bool:
@@ -123,7 +150,7 @@ def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
         aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)) if flat else None,
-        foot=_filled(foot) if flat else None,
+        foot=_filled(foot) if flat else None, root=_filled(torso[:, :2]) if flat else None,
         way=way_in_studio(frames, solids, camera) if straight else None, outlines=tuple(outlines),
     )  # fmt: skip
 

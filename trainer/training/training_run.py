@@ -22,6 +22,7 @@ import torch
 
 from onedemo.config import RunConfig
 from onedemo.core.files import read_whole
+from onedemo.demos.library import read_frames
 from onedemo.render.render_thread import Drawing
 from onedemo.reward.dataset import TrainingSet
 from onedemo.reward.model import Snapshot
@@ -44,7 +45,7 @@ from onedemo.types import Clip, Demo, Rollouts
 from onedemo.vision import silhouette
 from onedemo.vision.encoders import Encoder, demo_features
 from onedemo.vision.mask_file import masks_of
-from onedemo.vision.pose_estimator import Track
+from onedemo.vision.pose_estimator import Track, with_ground
 from onedemo.vision.silhouette import Silhouette
 
 _TIDY_S = 10.0
@@ -203,7 +204,11 @@ class TrainingRun:
         finally:
             self._learning = None
         self.preparing = "The robot is looked for in the demonstration video."
-        return features, shapes.track(masks_of(self.demo, shapes.reach), self.demo.fps)
+        track = shapes.track(masks_of(self.demo, shapes.reach), self.demo.fps)
+        if track is None:
+            return features, None
+        robot = robot_named(self.config.env)
+        return features, with_ground(track, read_frames(self.demo), self.demo.fps, robot)
 
     def looking(self) -> tuple[float | None, float | None]:
         """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.

@@ -8,12 +8,14 @@ Shapes: F demo frames, P numbers of a pose (``trainer/sim/kinematics.py``).
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from onedemo.core.files import read_whole, write_atomic
+from onedemo.render.mover import contact_of, is_studio, locate, travel_of
+from onedemo.robots.robot import Robot
 from onedemo.types import Demo
 
 
@@ -31,6 +33,21 @@ class Track:
     """How far it touches the ground, 0..1, (F,), float32, as ``body.contact``; None: not known."""
     doubt: np.ndarray | None = None
     """How unsure the pose is, (F,), float32: 0 is sure, 1 may be any; None: not said."""
+
+
+def with_ground(track: Track, frames: np.ndarray, fps: float, robot: Robot) -> Track:
+    """The same, with travel and contact by the floor itself in pictures of the robot's own studio.
+
+    Args:
+        track: What F frames show.
+        frames: (F, H, W, 3), uint8 RGB.
+        fps: Frames per second.
+        robot: The robot.
+    """
+    mover = locate(frames, robot) if is_studio(frames) else None
+    if mover is None or (travel := travel_of(mover, fps)) is None or (contact := contact_of(mover)) is None:
+        return track
+    return replace(track, travel=travel.astype(np.float32), contact=contact.astype(np.float32))
 
 
 def shipped_track(demo: Demo) -> Track | None:

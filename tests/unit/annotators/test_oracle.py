@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from helpers.small_world import Thumbnail, falling_demo, small_config
-from onedemo.annotators.oracle import Oracle, RatingBudgetSpent, appearance, make_rater
+from onedemo.annotators.oracle import (
+    THRESHOLDS,
+    Oracle,
+    RatingBudgetSpent,
+    appearance,
+    make_rater,
+    thresholds_of,
+)
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
+from onedemo.rl.random_states import random_states, wild_rollouts
 from onedemo.robots.registry import robot_named
 from onedemo.sim.kinematics import body_of
 from onedemo.storage.store import Store
@@ -183,3 +191,37 @@ def test_a_rater_that_tires_of_the_policy_does_not_stop_it(store, tmp_path, monk
     )
     summary = run(store, falling_demo(tmp_path / "demo"), "oracle")
     assert summary["ratings"] == 12 and summary["env_steps"] == 2400
+
+
+# Any robot
+
+
+def test_a_hopper_is_seen_as_ever():
+    """Results depend on the thresholds, so what is measured must stay the same to the last bit."""
+    rng = np.random.default_rng(0)
+    qpos, qvel = random_states(200, rng)
+    torso = qpos[:, 2]
+    thigh = torso - qpos[:, 3]
+    leg = thigh - qpos[:, 4]
+    parts = [1.5 * (qpos[:, 1] - 1.25)]
+    for angle, weight in ((torso, 1.0), (thigh, 0.7), (leg, 0.7), (leg - qpos[:, 5], 0.5)):
+        parts += [weight * np.sin(angle), weight * np.cos(angle)]
+    parts += [0.15 * np.clip(qvel[:, 2], -10, 10), 0.15 * qvel[:, 1], 0.08 * qvel[:, 0]]
+    np.testing.assert_allclose(appearance(qpos, qvel, HOPPER), np.stack(parts, axis=-1), atol=1e-12)
+    assert thresholds_of(HOPPER).tolist() == list(THRESHOLDS)
+
+
+@pytest.mark.parametrize("name", ["walker2d", "half-cheetah", "swimmer", "ant", "humanoid"])
+def test_any_robot_is_rated_by_how_far_it_is(name):
+    """Its own states are a 5, wherever they are on the floor, those of other lanes are bad on average."""
+    robot = robot_named(name)
+    rollouts = wild_rollouts(name, lanes=6, steps=40, every=40, seed=0, nthread=0)
+    actions = rollouts.actions[0, :-1]
+    own = HiddenStates(obs=rollouts.obs[0], actions=actions, qpos=rollouts.qpos[0], qvel=rollouts.qvel[0])
+    oracle = Oracle(own, name, budget=20)
+    assert oracle.rate(rollouts.segment(0, 5, 20), 5) == 5
+    others = [oracle.rate(rollouts.segment(lane, 5, 20), 5) for lane in range(1, 6)]
+    assert np.mean(others) < 3.5
+    further = rollouts.qpos[0].copy()
+    further[:, : robot.unseen] += 10
+    assert oracle.true_similarity(further, rollouts.qvel[0]) == 5

@@ -83,3 +83,65 @@ def test_shapes_and_turns():
     assert BODY.pose(obs).shape == BODY.motion(obs).shape == (2, 3, BODY.pose_size)
     np.testing.assert_allclose(BODY.pose(turned), BODY.pose(obs), atol=1e-9)
     np.testing.assert_allclose(BODY.motion(turned), BODY.motion(obs), atol=1e-9)
+
+
+# Any robot
+
+
+@pytest.mark.parametrize("name", ["hopper", "walker2d", "half-cheetah", "ant", "humanoid"])
+def test_what_touches_the_ground_is_what_mujoco_says(name):
+    """There is contact where MuJoCo has one with the floor, which sets in at up to 2 cm."""
+    robot, body = robot_named(name), body_of(robot_named(name))
+    rollouts = wild_rollouts(name, lanes=8, steps=40, every=20, seed=0, nthread=0)
+    qpos = rollouts.qpos[:, ::8].reshape(-1, robot.positions)
+    obs = robot.observe(qpos, np.zeros((len(qpos), robot.velocities)))
+    model = mujoco.MjModel.from_xml_path(str(robot.xml))
+    data, floor = mujoco.MjData(model), np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    touches = []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        touches.append(any(np.isin(data.contact[c].geom, floor).any() for c in range(data.ncon)))
+    contact, touches = body.contact(obs), np.array(touches)
+    lowest = np.minimum.reduce(list(body.clearances(qpos).values()))
+    np.testing.assert_allclose(contact, np.clip(1 - lowest / kinematics.CONTACT_REACH, 0, 1), atol=1e-9)
+    assert touches.any() and not touches.all()
+    assert contact[touches].min() > 0.3 and contact[lowest > 0.03].max() == 0
+
+
+@pytest.mark.parametrize("name", ["walker2d", "half-cheetah", "swimmer", "ant", "humanoid"])
+def test_the_motion_of_any_robot_is_the_derivative_of_its_pose(name):
+    robot, body = robot_named(name), body_of(robot_named(name))
+    rollouts = wild_rollouts(name, lanes=8, steps=20, every=20, seed=0, nthread=0)
+    qpos = rollouts.qpos[:, 5]
+    qvel = np.clip(rollouts.qvel[:, 5], -1, 1)
+    if name == "swimmer":  # followed up the picture, too: its height is never another
+        qvel[:, 1] = 0
+    model = mujoco.MjModel.from_xml_path(str(robot.xml))
+    after = qpos.copy()
+    for q, v in zip(after, qvel, strict=True):
+        mujoco.mj_integratePos(model, q, v, 1e-6)
+    change = (body.pose(robot.observe(after, qvel)) - body.pose(robot.observe(qpos, qvel))) / 1e-6
+    motion = body.motion(robot.observe(qpos, qvel)) / kinematics.MOTION_SCALE
+    np.testing.assert_allclose(motion, change, atol=1e-4)
+    assert body.pose(robot.observe(qpos, qvel)).shape == (8, body.pose_size)
+
+
+def test_ends_are_compared_where_directions_do_not_say_where_they_are():
+    """Limbs that hang at each other's ends need none; a humanoid's hips are beside its spine."""
+    sizes = {name: body_of(robot_named(name)) for name in ("hopper", "walker2d", "ant", "humanoid")}
+    ends = {name: (body.pose_size - 1) // 2 - len(body.weights) for name, body in sizes.items()}
+    assert ends["hopper"] == ends["walker2d"] == ends["ant"] == 0 < ends["humanoid"]
+    hopper, rollouts = sizes["hopper"], wild_rollouts("hopper", lanes=8, steps=40, every=20, seed=0)
+    qpos = rollouts.qpos.reshape(-1, 6)
+    points = np.stack(list(hopper.points(qpos).values()), axis=1) - qpos[:, None, None, :2]
+    known = np.concatenate([np.ones((len(qpos), 1)), hopper.axes(qpos).reshape(len(qpos), -1)], axis=1)
+    wanted = points.reshape(len(qpos), -1)
+    found = known @ np.linalg.lstsq(known, wanted, rcond=None)[0]
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_what_is_rigid_or_small_counts_less():
+    assert BODY.weights.tolist() == [1.0, 0.7, 0.7, 0.5]
+    ant = body_of(robot_named("ant"))
+    assert ant.weights.tolist() == [1, 1, 1, *([0, 0.7, 0.5] * 4)]  # hips are one piece with the torso

@@ -70,7 +70,14 @@ def demo_of(name, directory):
     save_hidden(hidden_path(video), hidden)
     sha256 = hashlib.sha256(video.read_bytes()).hexdigest()
     demo = Demo(
-        name=f"{name}-waves", sha256=sha256, path=video, fps=FPS, frames=FRAMES, width=160, height=120
+        name=f"{name}-waves",
+        sha256=sha256,
+        path=video,
+        fps=FPS,
+        frames=FRAMES,
+        width=160,
+        height=120,
+        robot=name,
     )
     seen = body.seen(hidden.obs[shown])
     return demo, hidden, Track(**{field: x.astype(np.float32) for field, x in seen._asdict().items()})
@@ -99,10 +106,9 @@ def test_a_demo_whose_track_is_seen_is_trained_on(name, tmp_path):
     class Eye:
         """What there is to know of how this robot looks: all."""
 
-        def knows(self, features):
-            return True
+        reach = 1.0
 
-        def track(self, features, fps):
+        def track(self, found, fps):
             return track
 
     config = config_of(name)
