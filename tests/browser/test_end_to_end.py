@@ -90,13 +90,13 @@ def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
         skip_practice(page)
         expected = [rate(page, data_dir, value, how) for value, how in ways]
     assert rows(data_dir) == expected
-    until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 180)
+    until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 600)
     with opened(chromium, links["researcher"], TINY) as page:
         page.click('.od-tabs >> text="Watch"')
         page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 150")
         where = page.locator("canvas[data-engine]").bounding_box()
         seen: set[bytes] = set()  # empty, drawn, and moving
-        until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 180)
+        until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 600)
         page.click('.od-tabs >> text="Data"')
         page.wait_for_selector(f".od-data >> text=method {method}")
         with page.expect_download() as download:
@@ -125,7 +125,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     with opened(chromium, links["annotator"]) as page:
         skip_practice(page)
         given = [rate(page, data_dir, value) for value in (1, 2, 3, 1, 2)]
-        until(lambda: iterations(data_dir) >= 2, 180)
+        until(lambda: iterations(data_dir) >= 2, 600)
         given += [rate(page, data_dir, value) for value in (4, 2)]
         page.keyboard.press("3")  # and the process dies in that moment
         child.kill()
@@ -136,7 +136,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     began = time.monotonic()
     _, again, log = serving.start(*QUICK)
     assert again, log.read_text()
-    assert time.monotonic() - began < 120
+    assert time.monotonic() - began < 600
     assert [link.split("token=")[1] for link in again.values()] == [
         link.split("token=")[1] for link in links.values()
     ]
@@ -144,7 +144,7 @@ def test_kill_9_in_the_middle_of_rating_loses_nothing(chromium, serving):
     with opened(chromium, again["annotator"]) as page:
         page.wait_for_selector(f".od-progress >> text=Everybody: {len(before)} of 45")
         rate(page, data_dir, 5)
-    until(lambda: iterations(data_dir) > done, 180)
+    until(lambda: iterations(data_dir) > done, 600)
     with closing(sqlite3.connect(data_dir / FILE_NAME)) as db:
         assert db.execute("SELECT COUNT(*) FROM runs").fetchone() == (1,)
         numbers = [n for (n,) in db.execute("SELECT number FROM iterations ORDER BY number")]

@@ -161,7 +161,7 @@ def test_without_opengl_the_page_says_so_and_what_was_drawn_is_rated(tmp_path, m
     settings = ["predictor.appearance=false", *FEW_STATES]
     with serving(tmp_path / "data", settings) as server, closing(Store(tmp_path / "data")) as store:
         (run,) = (row["id"] for row in store.runs.all())
-        wait_for(lambda: len(store.clips.waiting(run)) == 4)
+        wait_for(lambda: len(store.clips.waiting(run)) == 4, 600)
         drawn = {clip.id for clip in store.clips.waiting(run)}
         server.kill()
         monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))  # no driver is there
