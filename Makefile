@@ -17,17 +17,15 @@ run: .venv/.installed
 
 setup: .venv/.installed
 
-# Side by side on two cores. Those with servers and browsers stay together by file, which they share. They
-# wait for what others do during a third of their time, so three at once keep two cores busy.
-TWO := -n 2
-THREE_BY_FILE := -n 3 --dist loadfile --no-loadscope-reorder
+# Three at once on two cores: those with servers and browsers wait for what others do during a third of their
+# time. Tests of one file share servers and browsers and stay together; tests/conftest.py orders the files.
+SIDE_BY_SIDE := -n 3 --dist loadfile --no-loadscope-reorder
 
 test: .venv/.installed-test
-	$(BIN)/python -m pytest $(TWO) -m "not seam"
-	$(BIN)/python -m pytest $(THREE_BY_FILE) -m seam
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE)
 
 test-fast: .venv/.installed-test
-	$(BIN)/python -m pytest $(TWO) -m "not seam and not slow"
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not seam and not slow"
 
 check: .venv/.installed-test
 	$(BIN)/ruff check .

@@ -1,10 +1,14 @@
 // Addresses of tabs: /r/N/data is the tab Data of N's page; /r/N/ becomes that of the tab that the server shows
-// first. Back, reload and a link lead there, and the window is called after the tab and the run.
+// first. Back, reload and a link lead there, and the window is called after the tab and the run. Which runs are
+// compared follows behind "#": /r/N/runs#compare=hop-1,hop-2.
 //
 // Not a module: it must have run before Viser, which begins while the page is still being read.
-(() => {
+const address = (() => {
   "use strict";
   const { viserKey } = page; // static/page.js
+
+  const behind = () => new URLSearchParams(location.hash.slice(1)).get("compare");
+  let compared = behind(); // by whoever sent the address, until the tab is there
 
   // Viser writes its server into the address bar when the page has a path; here that is always ours.
   const replaceState = history.replaceState.bind(history);
@@ -50,4 +54,16 @@
   }
   new MutationObserver(look).observe(document.documentElement, { childList: true, subtree: true });
   window.addEventListener("popstate", follow);
+
+  return {
+    // Names of runs that the address says are compared, with commas between them; null if it says nothing.
+    get compared() {
+      return compared ?? behind();
+    },
+    // From now on it says these; null: nothing.
+    set compared(names) {
+      compared = null;
+      replaceState(null, "", location.pathname + (names === null ? "" : `#compare=${names}`));
+    },
+  };
 })();

@@ -26,6 +26,11 @@ const charts = (() => {
       this.run = run;
     }
 
+    // Whether the server has said all that it knows by now.
+    get answered() {
+      return this.#gone || this.live !== undefined;
+    }
+
     get due() {
       const pause = this.live === false ? settings.restMs : settings.askMs;
       return this.readers.size && !this.#asking && !this.#gone && performance.now() - this.#askedAt >= pause - 50;
@@ -37,7 +42,10 @@ const charts = (() => {
       try {
         const answer = await line.request(`curves.json?run=${encodeURIComponent(this.run)}&after=${this.last}`);
         if (answer.status === 401) await line.ended();
-        if ([400, 401, 403, 404].includes(answer.status)) this.#gone = true;
+        if ([400, 401, 403, 404].includes(answer.status)) {
+          this.#gone = true;
+          for (const read of [...this.readers]) read(this);
+        }
         if (answer.ok) this.#take(await answer.json());
       } catch (error) {
         if (!line.unanswered(error)) throw error;
@@ -46,12 +54,13 @@ const charts = (() => {
       }
     }
 
-    #take({ last, columns, marks, levels, colour, live }) {
+    #take({ last, columns, marks, levels, colour, title, live }) {
       const first = this.last === 0;
-      const changed = first || columns.number.length || JSON.stringify(marks) !== JSON.stringify(this.marks);
+      const told = ([marks, levels, title]) => JSON.stringify([marks, levels, title]);
+      const changed = first || columns.number.length || told([marks, levels, title]) !== told([this.marks, this.levels, this.title]);
       for (const [name, values] of Object.entries(columns))
         this.columns[name] = first ? values : this.columns[name].concat(values);
-      Object.assign(this, { last, marks, levels, colour, live });
+      Object.assign(this, { last, marks, levels, colour, title, live });
       if (this.columns.number.length > settings.most) this.last = 0; // asked for anew, thinned
       if (changed) for (const read of [...this.readers]) read(this);
     }
@@ -66,7 +75,7 @@ const charts = (() => {
   function follow(run, read) {
     const feed = feedOf(run);
     feed.readers.add(read);
-    if (feed.colour) read(feed);
+    if (feed.answered) read(feed);
     ask();
     return () => feed.readers.delete(read);
   }
@@ -172,7 +181,14 @@ const charts = (() => {
 
     draw() {
       this.feeds = this.runs.map((run) => feeds.get(run)).filter((feed) => feed?.columns.number?.length);
-      if (this.feeds.length) for (const chart of this.charts) chart.draw();
+      for (const chart of this.charts) chart.draw();
+    }
+
+    // What a run is called here: by its title, if no other one has that.
+    nameOf(run) {
+      const { title } = feedOf(run);
+      const alone = this.runs.filter((other) => feedOf(other).title === title).length === 1;
+      return !title ? run : alone ? title : `${title} (${run})`;
     }
 
     end() {
@@ -192,6 +208,7 @@ const charts = (() => {
       this.place = figure.querySelector(".od-plot");
       this.value = figure.querySelector(".od-value");
       this.legend = figure.querySelector(".od-legend-of-chart");
+      this.nothing = figure.querySelector(".od-nothing");
       this.series = JSON.parse(figure.dataset.series);
       this.limits = JSON.parse(figure.dataset.limits ?? "[null, null]");
       this.span = Number(figure.dataset.span ?? 0);
@@ -211,14 +228,18 @@ const charts = (() => {
           const values = feed.columns[column];
           if (!values?.some((value) => value != null)) return;
           const looks = look(this.series.length > 1 ? k + 1 : feed.colour);
-          lines.push({ label: several ? feed.run : label, ...looks, faint: true }, { label: several ? feed.run : label, ...looks });
+          const named = { run: feed.run, label: several ? this.group.nameOf(feed.run) : label, ...looks };
+          lines.push({ ...named, faint: true }, named);
           columns.push(values, smoothed(values, smoothing));
         });
         const level = this.figure.dataset.level;
-        if (columns.length && level && !several) {
-          const values = feed.levels[level] != null ? feed.columns[x].map(() => feed.levels[level]) : feed.columns[level];
+        if (columns.length && level) {
+          const constant = feed.levels[level];
+          const values = constant != null ? feed.columns[x].map(() => constant) : feed.columns[level];
           if (values?.some((value) => value != null)) {
-            lines.push({ label: "the demo itself", stroke: style("--od-muted"), dash: [5, 4], level: true });
+            const own = several && (constant == null || known.filter(({ levels }) => levels[level] === constant).length === 1);
+            const stroke = own ? look(feed.colour).stroke : style("--od-muted");
+            lines.push({ run: feed.run, label: "the demo itself", stroke, dash: [5, 4], level: true, own });
             columns.push(values);
           }
         }
@@ -231,6 +252,8 @@ const charts = (() => {
       if (!this.place.checkVisibility()) return; // in a fold: once that is opened
       const { lines, data } = this.#table();
       this.figure.toggleAttribute("data-drawn", Boolean(data));
+      const known = this.group.runs.every((run) => feedOf(run).answered);
+      this.nothing.textContent = known ? this.figure.dataset.nothing : "Loading…";
       if (!data) return this.#drop();
       const key = JSON.stringify(lines);
       if (key !== this.#drawn) this.#drop();
@@ -326,9 +349,9 @@ const charts = (() => {
       const compared = this.group.element.dataset.several !== undefined;
       this.value.textContent = compared || main.length > 1 ? "" : told(main[0]?.value); // else in the legend
       // Of several runs those without a value, too, so that nobody looks for their line; one may be new here.
-      const empty = ({ run, colour }) => ({ label: run, ...look(colour ?? 1), value: null });
+      const empty = (run) => ({ label: this.group.nameOf(run), ...look(feedOf(run).colour ?? 1), value: null });
       const listed = compared
-        ? this.group.runs.map((run) => main.find(({ label }) => label === run) ?? empty(feedOf(run)))
+        ? this.group.runs.map((run) => main.find((line) => line.run === run) ?? empty(run))
         : main;
       this.legend.replaceChildren(...(compared || main.length > 1 ? listed.map((line) => this.#item(line)) : []));
       this.place.setAttribute("aria-label", `${this.title}: ${main.map(({ label, value }) => (main.length > 1 ? `${label} ${told(value)}` : told(value))).join(", ")}`);
@@ -342,7 +365,10 @@ const charts = (() => {
       const smooth = this.group.smoothing > 0;
       const title = document.createElement("b");
       title.textContent = this.group.x === "number" ? `Iteration ${told(x[index])}` : `${short(x[index])} control steps`;
-      const items = rows.filter(({ faint, value }) => !faint && value != null).map((line) => {
+      // A level of several runs is told once; those that each run has for itself, unless they are too many.
+      const levels = new Set();
+      const said = ({ level, own, value }) => !level || (own ? main.length < 4 : levels.size < levels.add(value).size);
+      const items = rows.filter((line) => !line.faint && line.value != null && said(line)).map((line) => {
         const item = this.#item(line);
         if (smooth && !line.level) item.append(` (measured ${told(line.raw)})`);
         return item;

@@ -1,5 +1,5 @@
 // Draws a side of a clip: a frame out of its picture, and what is known of it (trainer/render/framing.py):
-// heights, the way along the floor, the first pose, the paths of head and foot. Metres, where not pixels.
+// heights, the way along the floor, the first pose, the paths of its ends. Metres, where not pixels.
 const drawing = (() => {
   "use strict";
   const INK = "24 32 43";
@@ -139,6 +139,7 @@ const drawing = (() => {
 
   // At the top right, where there is neither a caption nor the floor.
   function drawPace({ pen, width, unit }, pace) {
+    if (width < 165 * unit) return; // the caption has all the room
     const word = { 1: "1×", 0.5: "½×", 0.25: "¼×" }[pace];
     pen.font = `600 ${12 * unit}px system-ui, sans-serif`;
     pen.fillStyle = "rgb(255 255 255 / 72%)";

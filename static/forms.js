@@ -50,14 +50,31 @@
     return said.charAt(0).toUpperCase() + said.slice(1);
   };
 
-  // Which runs are compared: their names, in a field that Viser sends on and nobody sees; "," is none.
+  // Which runs are compared: their names, in a field that Viser sends on and nobody sees; "," is none. The
+  // address says the same (static/address.js).
+  const compareField = () => document.querySelector("div:has(> .od-runs) + div input");
   function compareOnly(runs) {
-    const field = document.querySelector("div:has(> .od-runs) + div input");
-    const value = runs.length === 1 && !runs[0] ? "," : runs.join(", ");
+    const none = runs.length === 1 && !runs[0];
+    address.compared = runs.length ? runs.join(",") : null;
+    const field = compareField();
     // React sees a change only through the element's own setter.
-    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, value);
+    Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set.call(field, none ? "," : runs.join(", "));
     field.dispatchEvent(new Event("input", { bubbles: true }));
   }
+  // When the tab comes: what the address says, or else what was compared before is said in it.
+  let fieldBefore = null;
+  function compareAsAddressed() {
+    const field = compareField();
+    if (field === fieldBefore) return;
+    fieldBefore = field;
+    if (!field) return;
+    if (address.compared !== null) compareOnly(address.compared.split(","));
+    else if (field.value) address.compared = field.value.split(",").map((name) => name.trim()).filter(Boolean).join(",");
+  }
+  new MutationObserver(compareAsAddressed).observe(document.documentElement, { childList: true, subtree: true });
+  window.addEventListener("popstate", () => {
+    if (compareField() && address.compared !== null) compareOnly(address.compared.split(","));
+  });
   function compare(run) {
     const on = [...document.querySelectorAll('[data-compare][aria-pressed="true"]')].map((b) => b.dataset.compare);
     const runs = on.includes(run) ? on.filter((name) => name !== run) : [...on, run];
@@ -189,6 +206,17 @@
         about.focus();
       },
     ).finally(() => (button.disabled = false));
+  });
+
+  // A demo that shows a robot is learned by that robot alone: the one is chosen with the other.
+  document.addEventListener("change", (event) => {
+    const form = event.target.closest?.(".od-new-run form");
+    if (!form || !["demo", "env"].includes(event.target.name)) return;
+    const [robot, demos] = [form.elements.env, form.elements.demo];
+    const shown = demos.selectedOptions[0]?.dataset.of;
+    if (event.target === demos && shown && [...robot.options].some((o) => o.value === shown)) robot.value = shown;
+    for (const option of demos.options) option.disabled = Boolean(option.dataset.of) && option.dataset.of !== robot.value;
+    if (demos.selectedOptions[0]?.disabled) demos.value = [...demos.options].find((o) => !o.disabled)?.value ?? "";
   });
 
   // The sentence at a field; none if it is empty.

@@ -123,6 +123,7 @@ const line = (() => {
   }
 
   function unconnected() {
+    if (document.querySelector(".od-nowebgl")) return; // that is why, and is said (static/page.js)
     const base = location.pathname.split(/\/r\/\d+/)[0];
     card("The page is here, but its live connection is not", [
       "If a proxy stands before onedemo, it must pass WebSockets and the Host header on. This prints the lines for nginx (or caddy):",

@@ -3,7 +3,7 @@
 // is done here (static/player.js). Keys with Alt, such as those of the tabs, are Viser's. What only a
 // researcher has is in static/forms.js.
 //
-// Not a module: it must have run before Viser, which begins while the page is still being read.
+// Not a module: it must have run before Viser.
 const page = (() => {
   "use strict";
   const { forget, main, toggleSlow, toggleTrail, watchPlayers } = clips; // static/player.js
@@ -14,11 +14,12 @@ const page = (() => {
   document.cookie = `scheme=${dark.matches ? "dark" : "light"}; path=/; SameSite=Lax`;
   dark.addEventListener("change", () => location.reload());
 
-  // Viser sorts Gaussian splats with functions that it makes of text, which the policy of the page refuses, and
-  // loads that sorter with every page. No splats are drawn here: it waits for its code for ever.
+  // Viser loads two things with every page that are of no use here, and wait for their data for ever: a sorter
+  // of Gaussian splats, which makes functions of text, as the policy of the page forbids, and the picture that
+  // would light the robot (it has lamps: app/tabs/watch.py), dear to prepare without a GPU.
   const fetchAnything = window.fetch.bind(window);
   window.fetch = (what, ...options) =>
-    String(what).startsWith("data:application/wasm") ? new Promise(() => {}) : fetchAnything(what, ...options);
+    /^data:(application\/wasm|image\/jpeg)/.test(what.url ?? what) ? new Promise(() => {}) : fetchAnything(what, ...options);
 
   const shown = (selector) => document.querySelector(selector);
 
@@ -218,7 +219,8 @@ const page = (() => {
   }
 
   function sayWhy(box, reason) {
-    send({ press: "reason", clip: Number(box.dataset.clip), reason });
+    const { clip, pair } = box.dataset;
+    send(pair ? { press: "pair reason", pair: Number(pair), reason } : { press: "reason", clip: Number(clip), reason });
   }
 
   // Keys that concern this browser alone. True if the key was one of them.
@@ -394,8 +396,9 @@ const page = (() => {
       return false;
     }
   }
-  document.addEventListener("DOMContentLoaded", () => {
-    if (webgl()) return;
+  // Asked only where the page does not come: a context of WebGL takes a tenth of a second without a GPU.
+  seen(pageName, 3000).then((name) => {
+    if (name || webgl()) return;
     const note = document.createElement("p");
     note.className = "od-nowebgl";
     note.setAttribute("role", "alert");

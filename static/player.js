@@ -17,7 +17,7 @@ const clips = (() => {
   const marks = new Map(); // of clips that are not answered yet: another tab takes them off the page
   const chosen = (name) => localStorage.getItem(`onedemo-${name}`) === "on";
   let slow = chosen("slow");
-  let trail = chosen("trail"); // first pose, and the paths of head and foot
+  let trail = chosen("trail"); // first pose, and the paths of head and feet
 
   // A bitmap stays decoded; an element's picture may have to be decoded again when it is drawn.
   async function decoded(source) {

@@ -88,16 +88,20 @@
 
   // ---- The canvas goes with the page where that scrolls
 
-  // Looked at in each frame: a resize may move the page without saying so.
+  // Looked at in each frame, while Watch is shown: a resize may move the page without saying so.
   const narrow = window.matchMedia("(max-width: 900px)");
   let page = null;
   let scrolled = "";
+  let going = false;
   function goWith() {
+    going = narrow.matches && document.querySelector('.od-header[data-tab="watch"]') !== null;
+    if (!going) return;
     if (!page?.isConnected) page = document.querySelector(".mantine-Paper-root:has(.od-header)");
     const now = `${page?.scrollTop ?? 0}px`;
     if (now !== scrolled) document.documentElement.style.setProperty("--od-scrolled", (scrolled = now));
-    if (narrow.matches) requestAnimationFrame(goWith);
+    requestAnimationFrame(goWith);
   }
-  narrow.addEventListener("change", goWith);
-  goWith();
+  const begin = () => going || goWith();
+  new MutationObserver(begin).observe(document.documentElement, { childList: true, subtree: true });
+  narrow.addEventListener("change", begin);
 })();

@@ -1,7 +1,7 @@
 """The records that move between the rooms. All frozen: what was measured does not change later.
 
-Shapes: N lanes (parallel episodes), T control steps, o = 11 observations, a = 3 actions,
-q = v = 6 positions and velocities. Arrays are lane-first, (N, T, ...).
+Shapes: N lanes (parallel episodes), T control steps, o observations, a actions, q positions and v velocities
+of the robot (of a hopper 11, 3, 6 and 6). Arrays are lane-first, (N, T, ...).
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ class Demo:
     """The robot that it was made with, and for; "" for a video of anything else, which is for any robot."""
     source: str = ""
     """What the video was made from: a file name or a command."""
+    edits: str = ""
+    """What was done to that video on its way in, in a few words."""
 
     @property
     def seconds(self) -> float:
@@ -189,3 +191,8 @@ class Status:
     """Ratings asked for in all."""
     next_clips_s: float | None = None
     """Seconds until the iteration ends, and with it new clips are expected; None if not known."""
+
+    @property
+    def asked_ratings(self) -> int:
+        """Ratings that people are asked for so far, as ``RatingQueue.asked``."""
+        return self.target_ratings if self.iteration else self.pretrain_ratings

@@ -28,8 +28,9 @@ from onedemo.app.admin.inspection import (
 from onedemo.config import RunConfig, load_config
 from onedemo.core.files import ON_SHARED, archive_fault, jpeg_fault
 from onedemo.core.shared_disks import file_system, is_shared
+from onedemo.demos.edits import Options
 from onedemo.demos.library import is_whole, list_demos
-from onedemo.demos.sandboxed_decoder import Options, decode
+from onedemo.demos.sandboxed_decoder import decode
 from onedemo.demos.video import write_webm
 from onedemo.errors import UserError
 from onedemo.render.render_thread import RenderThread

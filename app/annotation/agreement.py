@@ -15,7 +15,6 @@ from typing import NamedTuple
 import krippendorff
 import numpy as np
 
-from onedemo.robots.registry import robot_named
 from onedemo.storage.store import Store
 
 _CLASSES = 5
@@ -128,7 +127,7 @@ def verdict(alpha: float | None) -> str:
 
 def rating_rows(store: Store, run: str, most: int = 5000) -> list[RatingRow]:
     """The newest ratings of a run that hold, oldest first."""
-    dt = robot_named("hopper").dt
+    dt = next((entry["step_seconds"] for entry in store.runs.all() if entry["id"] == run), 0.0)
     columns = ("clip_id", "rater", "value", "repeat", "latency_ms", "predicted", "steps")
     rows = store.ratings.newest(run, most, columns)
     return [

@@ -154,6 +154,11 @@ class Assignment:
         with self._lock:
             self._leases[clip] = Lease(holder, now + self.lease_seconds)
 
+    def beside(self, clips: Collection[int], *, now: float) -> int:
+        """How many clips that are not among these are on somebody's screen, or come there next."""
+        with self._lock:
+            return sum(lease.until > now and clip not in clips for clip, lease in self._leases.items())
+
     def release(self, holder: Hashable, clip: int | None = None) -> None:
         """Frees a clip of a page, or all of them if none is named."""
         with self._lock:

@@ -46,8 +46,10 @@ class ComparisonSession:
         """The pair on screen, None while there is none."""
         self.upcoming: int | None = None
         """The pair after it, to be fetched ahead."""
-        self.skipped = False
-        """Whether the last press skipped a pair."""
+        self.skipped: int | None = None
+        """The pair that was skipped last, as long as its reason may still be said."""
+        self.explained = False
+        """Whether the reason of the last skip was said, until the next press."""
         self.taken_back: str | None = None
         """What was said of the pair on screen before it was taken back."""
 
@@ -62,9 +64,10 @@ class ComparisonSession:
         with self._lock:
             before = self.current, self.upcoming
             if self.current is None:
-                skipped = self.skipped
+                skipped, explained = self.skipped, self.explained
                 self._advance()
-                self.skipped = skipped and self.current is None
+                if self.current is None:  # the reason of the last skip may still be said
+                    self.skipped, self.explained = skipped, explained
             elif self.upcoming is None:
                 self.upcoming = self._pick()
             return before != (self.current, self.upcoming)
@@ -97,7 +100,22 @@ class ComparisonSession:
                 self._advance()
             except sqlite3.Error:  # the answer is kept all the same; `refill` looks again
                 log.exception("no next pair could be looked for")
-            self.skipped = answer == "skip"
+            self.skipped = pair if answer == "skip" else None
+            return True
+
+    def explain(self, pair: int, reason: str) -> bool:
+        """Says why the pair skipped last was skipped; False if it is another one, or was taken back.
+
+        Raises:
+            ValueError: If the reason is too long.
+            sqlite3.Error: If it could not be committed.
+        """
+        with self._lock:
+            last = self._store.comparisons.last_compared(self._run, self._rater.id)
+            if pair != self.skipped or last != (pair, "skip"):
+                return False
+            self._store.comparisons.compare(pair, self._rater.id, "skip", 0, reason=reason)
+            self.skipped, self.explained = None, True
             return True
 
     def undo(self, pair: int) -> bool:
@@ -137,6 +155,6 @@ class ComparisonSession:
 
     def _show(self, pair: int | None) -> None:
         self.current, self._shown_at = pair, self._clock()
-        self.skipped, self.taken_back = False, None
+        self.skipped, self.taken_back, self.explained = None, None, False
         if pair is not None:
             self._assignment.hold(self._holder, pair, now=self._shown_at)

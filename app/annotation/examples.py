@@ -17,11 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from onedemo.sim.kinematics import HEIGHT_SCALE
+from onedemo.robots.registry import DEFAULT, robot_named
+from onedemo.robots.robot import Robot
+from onedemo.sim.kinematics import HEIGHT_SCALE, body_of
 from onedemo.vision.pose_estimator import Track
 
-_WEIGHTS = np.array([1.0, 0.7, 0.7, 0.5])
-"""How much the direction of torso, thigh, leg and foot counts: the torso is large, the foot small."""
+_LIMBS = 1.23
+"""Sum of the squared weights of all limbs (``Body.weights``), beside 1 of the root: however many there are,
+people see the robot as a whole."""
 _BANDS = {5: (0.0, 0.0), 4: (0.75, 0.95), 3: (1.25, 1.45), 2: (1.7, 1.9), 1: (2.8, np.inf)}
 """Distances at which a clip is a clear case of a rating; 1 is a difference that is seen at once."""
 _PRACTICE = (5, 1, 3, 4, 2)
@@ -75,8 +78,9 @@ class Examples:
 
 
 def choose(
-    track: Track | None, frames: int, length: int, others: Mapping[str, Track] | None = None
-) -> Examples:
+    track: Track | None, frames: int, length: int, others: Mapping[str, Track] | None = None,
+    robot: Robot | None = None,
+) -> Examples:  # fmt: skip
     """Chooses the examples of a demo.
 
     Args:
@@ -84,12 +88,13 @@ def choose(
         frames: F.
         length: L.
         others: The same of other demos of the robot, by name.
+        robot: The robot; the hopper if None.
     """
     if track is None:
         middle = (frames - length) // 2
         same = [Example(left=n, right=n, rating=5, why=_why(5, 0, 0)) for n in (middle, middle // 2)]
         return Examples(guide=tuple(same[:1]), practice=tuple(same[1:]))
-    chooser = _Chooser({"": track, **(others or {})}, length)
+    chooser = _Chooser({"": track, **(others or {})}, length, weights_of(robot or robot_named(DEFAULT)))
     guide = [chooser.next(rating) for rating in (1, 2, 3, 4, 5)]
     practice = [chooser.next(rating) for rating in _PRACTICE]
     more = [example.rating for example in practice if example is not None]
@@ -106,15 +111,16 @@ class _Chooser:
     Args:
         tracks: Of the demo, and of others by name.
         length: L.
+        weights: How much each axis and end counts, (A + K,).
     """
 
-    def __init__(self, tracks: Mapping[str, Track], length: int) -> None:
+    def __init__(self, tracks: Mapping[str, Track], length: int, weights: np.ndarray) -> None:
         moments = [len(track.pose) - length + 1 for track in tracks.values()]
         self._where = [(name, n) for name, count in zip(tracks, moments, strict=True) for n in range(count)]
         # Frames of other demos are far from all of this one.
         self._at = np.concatenate([1e6 * k + np.arange(count) for k, count in enumerate(moments)])
         self._apart, self._own = max(4, length // 2), moments[0]
-        self._pose, self._pace, self._distance = _distances(list(tracks.values()), length)
+        self._pose, self._pace, self._distance = _distances(list(tracks.values()), length, weights)
         lively = _by_moment([np.linalg.norm(track.motion, axis=1) for track in tracks.values()], length)
         doubt = _by_moment([_doubt(track) for track in tracks.values()], length)
         # A clip in which something happens is better than one in which nothing does.
@@ -151,19 +157,32 @@ def _doubt(track: Track) -> np.ndarray:
     return track.doubt if track.doubt is not None else np.zeros(len(track.pose))
 
 
-def _seen(track: Track) -> tuple[np.ndarray, np.ndarray]:
-    """What a person sees of each frame, in units of what is seen at once: pose (F, 9) and pace (F, 2).
+def weights_of(robot: Robot) -> np.ndarray:
+    """How much each axis and each end of a robot's pose counts, (A + K,): the root's axes first.
+
+    Ends count nothing: directions all but tell where they are.
+    """
+    body = body_of(robot)
+    axes = 1 if body.planar else 3  # of the root
+    limbs = body.weights[axes:]
+    limbs = limbs * np.sqrt(_LIMBS / max(np.square(limbs).sum(), 1e-9))
+    ends = (body.pose_size - 1) // 2 - len(body.weights)
+    return np.concatenate([np.full(axes, 1 / np.sqrt(axes)), limbs, np.zeros(ends)])
+
+
+def _seen(track: Track, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a person sees of each frame, in units of what is seen at once: pose (F, P) and pace (F, 2).
 
     Sideways motion is not part of it: the camera follows.
     """
-    pose = np.concatenate([track.pose[:, :1], track.pose[:, 1:] * np.repeat(_WEIGHTS, 2)], axis=1)
+    pose = np.concatenate([track.pose[:, :1], track.pose[:, 1:] * np.repeat(weights, 2)], axis=1)
     spin = track.motion[:, 1] * track.pose[:, 2] - track.motion[:, 2] * track.pose[:, 1]
     return pose, np.stack([spin, track.motion[:, 0] / HEIGHT_SCALE], axis=1)
 
 
-def _distances(tracks: Sequence[Track], length: int) -> np.ndarray:
+def _distances(tracks: Sequence[Track], length: int, weights: np.ndarray) -> np.ndarray:
     """Mean distance of the frames of two clips, by their moments: in pose, in pace, in all; (3, M, N)."""
-    seen = [_seen(track) for track in tracks]
+    seen = [_seen(track, weights) for track in tracks]
     moments = [len(track.pose) - length + 1 for track in tracks]
     answer = np.zeros((3, moments[0], sum(moments)))
     for offset in range(length):

@@ -38,15 +38,26 @@ class Skip(Press, tag="skip"):
     clip: _Number
 
 
-class Explain(Press, tag="reason"):
-    """Why the clip was skipped that was skipped last."""
+class _Reason(Press):
+    """Why something was skipped."""
 
-    clip: _Number
     reason: Annotated[str, Meta(max_length=200)]
 
     def __post_init__(self) -> None:
         if not self.reason.strip() or not self.reason.isprintable():
             raise ValueError("a reason is one line of text")
+
+
+class Explain(_Reason, tag="reason"):
+    """Why the clip was skipped that was skipped last."""
+
+    clip: _Number
+
+
+class ExplainPair(_Reason, tag="pair reason"):
+    """The same of a pair."""
+
+    pair: _Number
 
 
 class Undo(Press, tag="undo"):
@@ -73,7 +84,7 @@ class PageGone(Exception):
     """The page at which something was pressed is not open any more."""
 
 
-_decoder = json.Decoder(Rate | Skip | Explain | Undo | Compare | Practise)
+_decoder = json.Decoder(Rate | Skip | Explain | ExplainPair | Undo | Compare | Practise)
 
 
 def read_press(body: bytes) -> Press:

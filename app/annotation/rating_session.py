@@ -46,6 +46,7 @@ class RatingSession:
         guard_seconds: A press that comes sooner after the clip was not made for it.
         clock: Seconds; replaced in tests.
         rng: Draws which clips are asked again.
+        wanted: How many more ratings are asked of everybody for now; None: no matter how many.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class RatingSession:
         guard_seconds: float = GUARD_SECONDS,
         clock: Callable[[], float] = time.monotonic,
         rng: random.Random | None = None,
+        wanted: Callable[[], int] | None = None,
     ) -> None:
         self._store = store
         self._run = run
@@ -71,6 +73,7 @@ class RatingSession:
         self._guard_seconds = guard_seconds
         self._clock = clock
         self._rng = rng or random.Random()
+        self._wanted = wanted
         self._lock = threading.RLock()
         self._shown_at = 0.0
         self._kind = self._assignment.again.draw(self._rng)
@@ -222,6 +225,8 @@ class RatingSession:
             self._assignment.release(self._holder, clip)
             self._current = None
             try:
+                if ask.kind == "shared":
+                    self._make_up()
                 self._advance()
             except sqlite3.Error:  # the answer is kept all the same; `refill` looks again
                 log.exception("no next clip could be looked for")
@@ -250,6 +255,9 @@ class RatingSession:
             if ask.kind == "fresh"
             else not self._store.ratings.holds(ask.clip, self.rater.id, repeat=ask.repeat)
         )
+        if ask.kind == "shared" and not self._room(more=0):
+            self._assignment.release(self._holder, ask.clip)
+            return False
         return asked and self._take([ask.clip]) is not None
 
     def _pick(self, waiting: list[int]) -> Ask | None:
@@ -263,9 +271,10 @@ class RatingSession:
         if self._kind != "fresh":
             kind, self._kind = self._kind, "fresh"
             mine = self._store.ratings.answered(self._run, rater_id=self.rater.id)
+            clip = None
             if kind == "repeated":
                 clip = self._take(to_repeat(mine, self.rater.id))
-            else:
+            elif self._room():
                 clip = self._take(to_share([*mine, *self._store.ratings.answered(self._run)], self.rater.id))
             if clip is not None:
                 return Ask(clip, kind)
@@ -273,8 +282,28 @@ class RatingSession:
         self.taken = clip is None
         return Ask(clip) if clip is not None else None
 
-    def _waiting(self) -> list[int]:
-        return [clip.id for clip in self._store.clips.waiting(self._run)]
+    def _room(self, more: int = 1) -> bool:
+        """Whether ratings of clips that others have rated are wanted beside those of all that wait.
+
+        Args:
+            more: How many, besides those that people have in hand.
+        """
+        if self._wanted is None:
+            return True
+        asked = {*self._waiting(), *self._waiting("cut")}
+        return self._wanted() >= len(asked) + self._assignment.beside(asked, now=self._clock()) + more
+
+    def _make_up(self) -> None:
+        """Withdraws clips for which no rating is wanted any more, since one was rated once more."""
+        if self._wanted is None:
+            return
+        ready = self._waiting()
+        surplus = len(ready) + len(self._waiting("cut")) - self._wanted()
+        if surplus > 0:  # the newest: nobody has those on screen yet
+            self._store.clips.set_state(ready[-surplus:], "withdrawn")
+
+    def _waiting(self, state: str = "ready") -> list[int]:
+        return [clip.id for clip in self._store.clips.waiting(self._run, state)]
 
     def _take(self, clips: list[int]) -> int | None:
         avoid = () if self._current is None else (self._current.clip,)

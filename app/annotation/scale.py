@@ -15,6 +15,9 @@ MEANINGS = (
 REASONS = ("I cannot see enough", "It is too short to tell", "The picture is broken")
 """Why a clip may be skipped."""
 
+PAIR_REASONS = ("I cannot see enough", "Too short to tell", "A picture is broken")
+"""Why a pair may be skipped."""
+
 WORDS = (
     ("Clip", "A third of a second of what the robot did, beside as much of the video.", True),
     ("Rating", "How alike the two sides of a clip are, from 1 to 5.", True),

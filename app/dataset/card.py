@@ -10,6 +10,7 @@ from typing import Any
 from onedemo.app.annotation.agreement import Quality, quality, quality_by_rater, rating_rows
 from onedemo.app.annotation.scale import ANSWERS
 from onedemo.app.dataset.columns import COMPARISONS, HISTORY, PAIRS, RATINGS, SEGMENTS, SKIPS, as_table
+from onedemo.demos.library import list_demos
 from onedemo.storage.rating_counts import Counts
 from onedemo.storage.store import Store
 from onedemo.training.runs import program_version
@@ -27,6 +28,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         now: When it is written.
     """
     runs = [entry for entry in store.runs.all() if run in (None, entry["id"])]
+    edits = {demo.sha256: demo.edits for demo in list_demos(store.path.parent / "demos")}
     when = f"{now or datetime.now(UTC):%Y-%m-%d %H:%M} UTC"
     parts = [
         f"# Ratings of robot motion: {_text(run) if run else 'all runs'}\n\n"
@@ -41,7 +43,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
         "from random actions at first (stage *pretrain*) and from the policy in training later (*online*); "
         "which clips were asked is in `choice`. It is no random sample of anything: later clips depend on "
         "earlier ratings.\n",
-        "## Runs\n\n" + "".join(_run(store, entry) for entry in runs),
+        "## Runs\n\n" + "".join(_run(store, entry, edits.get(entry["demo_sha256"], "")) for entry in runs),
         "## Columns of the ratings (CSV)\n\nUTF-8, one header, one row a rating that holds. A text that a "
         "spreadsheet would take for a formula begins with an apostrophe. Names may look like numbers: read "
         "them as text, in pandas with `dtype={'rater': str, 'run': str, 'demo': str}`.\n\n"
@@ -64,7 +66,7 @@ def card(store: Store, run: str | None = None, *, now: datetime | None = None) -
     return "\n".join(parts)
 
 
-def _run(store: Store, entry: dict[str, Any]) -> str:
+def _run(store: Store, entry: dict[str, Any], edits: str) -> str:
     run = entry["id"]
     people = {rater.name: rater for rater in store.accounts.raters()}
     rows = rating_rows(store, run)
@@ -81,7 +83,8 @@ def _run(store: Store, entry: dict[str, Any]) -> str:
         f"### {_text(run)}\n\nDemonstration {_text(entry['demo'])} (SHA-256 "
         f"{_text(entry['demo_sha256'][:16])}…), seed {_text(entry['seed'])}, "
         f"made {_text(entry['created_at'])} with onedemo {_text(entry['version'])}.\n\n"
-        f"{counts.given} ratings given, a row each in the CSV: {counts.used} used for training, "
+        + (f"What was done to the video of the demonstration: {_text(edits)}.\n\n" if edits else "")
+        + f"{counts.given} ratings given, a row each in the CSV: {counts.used} used for training, "
         f"{counts.repeats} repeats, {counts.excluded} of excluded raters. Beside them "
         f"{counts.skipped} skipped clips and {counts.withdrawn} withdrawn ratings.\n\n"
         + _line(heads) + _line(["---"] * len(heads)) + "".join(lines) + "\n" + _withdrawn(store, run)

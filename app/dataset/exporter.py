@@ -47,9 +47,12 @@ def write_export(store: Store, run: str | None, directory: Path) -> None:
 def write_file(store: Store, run: str | None, name: str, file: Path) -> None:
     """Writes one of ``FILES`` under another name; a file that is there is replaced once it is whole."""
     if name == "segments.parquet":
-        frames = {demo.sha256: demo.frames for demo in list_demos(store.path.parent / "demos")}
+        demos = {
+            demo.sha256: {"demo_frames": demo.frames, "demo_edits": demo.edits}
+            for demo in list_demos(store.path.parent / "demos")
+        }
         runs = [
-            entry | {"demo_frames": frames.get(entry["demo_sha256"])}
+            entry | demos.get(entry["demo_sha256"], {"demo_frames": None})
             for entry in store.runs.all()
             if run in (None, entry["id"])
         ]

@@ -28,6 +28,7 @@ from onedemo.storage.store import Store
 
 _RUN = ("id", "demo", "demo_sha256", "seed", "config", "version")
 _LONGEST_CONFIG = 1 << 20
+_LONGEST_EDITS = 300
 
 _PREDICTION = cell.number(-100.0, 100.0)
 _EVENT = {
@@ -245,6 +246,9 @@ def _check_run(run: Any, file: Path) -> None:
         frames = run.get("demo_frames")
         if frames is not None and (type(frames) is not int or not 0 < frames < 1_000_000):
             raise ValueError("demo_frames is out of range")
+        edits = run.get("demo_edits", "")
+        if not isinstance(edits, str) or len(edits) > _LONGEST_EDITS or not edits.isprintable():
+            raise ValueError("demo_edits is no line of text")
         if not 0 <= run["seed"] < 2**63 or isinstance(run["seed"], bool):
             raise ValueError("seed is out of range")
         if not re.fullmatch(r"[\w.+!-]{1,40}", run["version"], re.ASCII):
@@ -267,9 +271,10 @@ def _check_demos(runs: list[dict[str, Any]], data_dir: Path) -> None:
     for run in runs:
         demo, given = there.get(run["demo"]), run.get("demo_frames")
         if demo is not None and given is not None and demo.sha256 != run["demo_sha256"]:
+            edits = f" ({run['demo_edits']})" if run.get("demo_edits") else ""
             raise UserError(
-                f"run {run['id']} was rated beside a demo {demo.name} of {given} frames, and the one in "
-                f"{data_dir} has {demo.frames} and other pictures: give that another name (onedemo demo "
+                f"run {run['id']} was rated beside a demo {demo.name} of {given} frames{edits}, and the one "
+                f"in {data_dir} has {demo.frames} and other pictures: give that another name (onedemo demo "
                 "rename), and put the right one there"
             )
 

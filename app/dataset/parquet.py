@@ -65,7 +65,8 @@ def write_segments(
     Args:
         file: Where to.
         clips: In any order; read one by one.
-        runs: Those they belong to, as ``Store.runs.all`` gives them; ``demo_frames`` besides, if known.
+        runs: Those they belong to, as ``Store.runs.all`` gives them; ``demo_frames`` and
+            ``demo_edits`` besides, if known.
         roles: Of the raters, by name.
 
     Returns:

@@ -1,18 +1,20 @@
-"""The files of the page: our static ones, Viser's HTML with them added, and what of it may run.
+"""The files of the page: our static ones, Viser's client taken out of its one HTML file, and what may run.
 
-Viser's client is one HTML file: a short script unpacks the client from an attribute of its own element and
-runs it. The policy of the page names both by their digests, so nothing else that is inline runs, whatever
-gets into the page.
+Viser ships its client as a single HTML file: a short script unpacks style sheet and client from an attribute
+of its own element and runs them inline. Here they are unpacked once and served as files: a browser keeps
+them, compiled, where the one file came and was compiled anew at each load, and no script is inline.
 """
 
 from __future__ import annotations
 
-import base64
+import gzip
 import hashlib
 import re
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import viser
 import zstandard
 
@@ -29,76 +31,87 @@ POLICY = (
     "base-uri 'none'; object-src 'none'; frame-ancestors 'none'"
 )
 """Content-Security-Policy of everything but the page."""
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; script-src-attr 'none'; "
+    "worker-src blob:; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "media-src 'self' blob:; font-src 'self' data:; connect-src 'self' data: blob:; form-action 'self'; "
+    "base-uri 'none'; object-src 'none'; frame-ancestors 'none'"
+)
+"""Content-Security-Policy of the page.
+
+Viser needs WebAssembly, workers and pictures that it makes itself (blob:, data:), and writes styles; a
+video that somebody chooses to send is played before it is sent (media-src blob:). Viser
+would run JavaScript that its server sends, and sort Gaussian splats with generated code: both need
+unsafe-eval, and stay off. Its files, the socket included, come from here alone.
+"""
 
 _VISER_HTML = Path(viser.__file__).parent / "client" / "build" / "index.html"
 _LOADER = re.compile(r'<script data-p="([^"]*)" data-ss="(\d+)" data-cs="(\d+)">(.*?)</script>', re.DOTALL)
 """The script of Viser's HTML: what it unpacks, bytes of style sheet and script in that, and itself."""
+_DECODER = re.compile(r'gzWasm="([^"]*)"')
+"""In that script: the decoder of zstd, with which the client reads messages, too."""
 _DIGITS = "!#$%()*+,-./0123456789:;=?@ABCDEFGHIJKLMNOPQRSTUVWXYZ[\\]^_abcdefghijklmnopqrstuvwxyz{|}~"
-"""Of the numbers to the base 88 in which it is packed: five for four bytes."""
+"""Of the numbers to the base 88 in which both are packed: five for four bytes."""
+_SHARE_DECODER = (
+    "globalThis.__viserZstdWasm = await WebAssembly.compileStreaming("
+    'fetch(new URL("zstd.wasm", import.meta.url)));\n'
+)
+"""What Viser's own loader does before the client begins."""
 
 
-def page_html() -> str:
-    """Viser's page with our title, icon, style sheets and scripts, which run before its own.
+class Packed(NamedTuple):
+    """A file of Viser's client as it is sent."""
 
-    Its body begins before Viser's script: what is said while that loads can be seen.
-
-    Raises:
-        ValueError: If this version of Viser writes its head in another way.
-    """
-    html = _VISER_HTML.read_text()
-    start, icon, rest = html.partition('<link\n      rel="icon"')
-    _, end_of_icon, rest = rest.partition("/>")
-    before, title, after = rest.partition("<title>Viser</title>")
-    script, end_of_head, body = after.partition("</head>")
-    _, start_of_body, body = body.partition("<body>")
-    if not (icon and end_of_icon and title and end_of_head and start_of_body):
-        raise ValueError("Viser's page has changed: no icon, title or body where they were")
-    return "".join((start, before, render("head.html"), script, body))
+    body: bytes
+    """Packed with gzip: no browser of ours does without."""
+    kind: str
 
 
 @cache
-def viser_scripts() -> tuple[str, str]:
-    """The two scripts of Viser's page: the one that unpacks, and the client that it unpacks.
+def viser_files() -> dict[str, Packed]:
+    """Viser's client by the names of its files: style sheet, script, and the decoder that it needs.
 
     Raises:
         ValueError: If this version of Viser packs its client in another way.
     """
     found = _LOADER.search(_VISER_HTML.read_text())
-    if found is None or f'"{_DIGITS}"'.replace("\\", "\\\\") not in found[4]:
+    decoder = found and _DECODER.search(found[4])
+    if not (found and decoder) or f'"{_DIGITS}"'.replace("\\", "\\\\") not in found[4]:
         raise ValueError("Viser's page has changed: its client is not packed as it was")
-    packed, style, script, loader = found[1], int(found[2]), int(found[3]), found[4]
-    # An unfinished group counts as if its missing digits and bytes were zero at the front.
-    number = _DIGITS.index
-    unpacked = bytearray()
-    for start in range(0, len(packed), 5):
-        group, value = packed[start : start + 5], 0
-        for digit in group:
-            value = value * len(_DIGITS) + number(digit)
-        unpacked += value.to_bytes(len(group), "big")[1:]
-    client = zstandard.ZstdDecompressor().decompressobj().decompress(unpacked)
-    if len(client) != style + script:
+    style = int(found[2])
+    client = zstandard.ZstdDecompressor().decompressobj().decompress(_from_base_88(found[1]))
+    if len(client) != style + int(found[3]):
         raise ValueError("Viser's page has changed: its client is not packed as it was")
-    return loader, client[style:].decode()
+    wasm = gzip.decompress(_from_base_88(decoder[1].replace("\\\\", "\\")))
+    return {
+        "viser.css": _packed(client[:style], "text/css"),
+        "viser.js": _packed(_SHARE_DECODER.encode() + client[style:], "text/javascript"),
+        "zstd.wasm": _packed(wasm, "application/wasm"),
+    }
 
 
 @cache
-def page_policy() -> str:
-    """Content-Security-Policy of the page.
-
-    Viser needs WebAssembly, workers and pictures that it makes itself (blob:, data:), and writes styles; a
-    video that somebody chooses to send is played before it is sent (media-src blob:). Viser
-    would run JavaScript that its server sends, and sort Gaussian splats with generated code: both need
-    unsafe-eval, and stay off. Its files, the socket included, come from here alone.
+def page_html() -> str:
+    """The head of Viser's page with our title, icon, style sheets and scripts, which run before Viser's.
 
     Raises:
-        ValueError: As ``viser_scripts``.
+        ValueError: As ``viser_files``.
     """
-    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in viser_scripts()]
-    scripts = " ".join(f"'sha256-{digest}'" for digest in digests)
-    return (
-        f"default-src 'none'; script-src 'self' 'wasm-unsafe-eval' {scripts}; script-src-attr 'none'; "
-        "worker-src blob:; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-        "media-src 'self' blob:; font-src 'self' data:; "
-        "connect-src 'self' data: blob:; form-action 'self'; base-uri 'none'; "
-        "object-src 'none'; frame-ancestors 'none'"
-    )
+    digest = hashlib.sha256(b"".join(file.body for file in viser_files().values())).hexdigest()
+    return str(render("page.html", viser=digest[:16]))
+
+
+def _packed(data: bytes, kind: str) -> Packed:
+    return Packed(gzip.compress(data, compresslevel=9, mtime=0), kind)
+
+
+def _from_base_88(packed: str) -> bytes:
+    number = np.zeros(128, np.uint64)
+    number[[ord(digit) for digit in _DIGITS]] = np.arange(len(_DIGITS))
+    # An unfinished group counts as if its missing digits and bytes were zero at the front.
+    left = len(packed) % 5
+    whole = "!" * (-len(packed) % 5)
+    whole = packed[: len(packed) - left] + whole * bool(left) + packed[len(packed) - left :]
+    digits = number[np.frombuffer(whole.encode(), np.uint8)].reshape(-1, 5)
+    unpacked = (digits @ 88 ** np.arange(4, -1, -1, dtype=np.uint64)).astype(">u4").tobytes()
+    return unpacked[: len(unpacked) - 4] + unpacked[len(unpacked) - left + 1 :] if left else unpacked

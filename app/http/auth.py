@@ -18,7 +18,7 @@ from aiohttp import web
 
 from onedemo.app.http import assets
 from onedemo.app.http.sessions import RATER, Sessions
-from onedemo.app.http.tokens import hash_token, new_session_token
+from onedemo.app.http.tokens import hash_token, new_session_token, session_token_of
 from onedemo.app.network.bind import Listening
 from onedemo.app.network.rate_limit import (
     STRANGERS_AT_ONCE,
@@ -220,6 +220,8 @@ class AccessControl:
             response = self._login_page(200, token=token)
             # With no-referrer a browser would not say that it is this page that posts the form.
             response.headers["Referrer-Policy"] = "same-origin"
+            if not self.sessions.nonce(request):
+                self.sessions.put_nonce(request, response)
             return response
         return await self._open(request, token, link)
 
@@ -242,7 +244,9 @@ class AccessControl:
     async def _open(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
         if link is None:
             return await self._refuse(request, token, link)
-        session = await self._session_of(request, link) or new_session_token()
+        session = (
+            await self._session_of(request, link) or self._foreseen(request, token) or new_session_token()
+        )
         opened = await self._trade(token, session)
         if opened is None:
             return await self._refuse(request, token, link)
@@ -250,10 +254,23 @@ class AccessControl:
             await asyncio.to_thread(
                 self._store.audit.note, opened.rater.name, "signed in", f"link {opened.id}"
             )
+        return self._let_go_on(request, opened, session)
+
+    def _let_go_on(self, request: web.Request, link: Link, session: str) -> web.StreamResponse:
+        """The way to the person's page, with its cookies."""
         tab = self.sessions.kept_tab(request)
-        response = web.HTTPSeeOther(self._listening.page_path(opened.rater.id) + tab)
-        self.sessions.put(request, response, opened.rater.id, session)
+        response = web.HTTPSeeOther(self._listening.page_path(link.rater.id) + tab)
+        self.sessions.put(request, response, link.rater.id, session)
         return response
+
+    def _foreseen(self, request: web.Request, token: str) -> str | None:
+        """The session that this browser gets by a link that opens once: the same each time it asks.
+
+        The answer to the press of the button may be lost after the link was used up. It is known to whoever
+        has both the link and the number that came with the button.
+        """
+        nonce = self.sessions.nonce(request)
+        return session_token_of(token, nonce) if nonce else None
 
     async def _trade(self, token: str, session: str) -> Link | None:
         """As ``Accounts.open_link``; a link is not used up for somebody who was sent away meanwhile."""
@@ -280,6 +297,10 @@ class AccessControl:
         return None
 
     async def _refuse(self, request: web.Request, token: str, link: Link | None) -> web.StreamResponse:
+        if link is not None and link.state == "used" and (session := self._foreseen(request, token)):
+            came_by = await asyncio.to_thread(self._store.accounts.link_of_session, hash_token(session))
+            if came_by == link.id:  # asked again: the answer was lost on its way
+                return self._let_go_on(request, link, session)
         if link is not None and link.state in ("used", "expired") and request.method == "GET":
             # Clicked again in the browser that it let in? The person's own cookie is sent below /r/N alone.
             page = self._listening.page_path(link.rater.id)

@@ -83,6 +83,14 @@ class Files:
             raise web.HTTPNotFound()
         return self._served(folder, request)
 
+    async def viser(self, request: web.Request) -> web.StreamResponse:
+        """A file of Viser's client."""
+        file = assets.viser_files().get(request.match_info["name"])
+        if file is None:
+            raise web.HTTPNotFound()
+        headers = _KEEP | {"Content-Type": file.kind, "Content-Encoding": "gzip"}
+        return web.Response(body=file.body, headers=headers)
+
     def _served(self, folder: Path, request: web.Request) -> web.StreamResponse:
         path = folder / request.match_info["name"]
         if path.parent != folder or path.suffix not in assets.SERVED or not path.is_file():

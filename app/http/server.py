@@ -1,8 +1,8 @@
 """The public HTTP port: one table of what there is and who may have it.
 
 ``auth`` and ``sessions`` say who asks, ``media`` and ``exports`` hand out files, ``uploads`` takes videos,
-``viser_proxy`` carries the page's WebSocket to Viser. The page itself is Viser's single HTML file with our
-style sheet and scripts added (``assets``). The connections below all this are ``onedemo.app.network``.
+`viser_proxy`` carries the page's WebSocket to Viser. The page itself is our HTML and scripts, and Viser's
+client taken out of its one file (``assets``). The connections below all this are ``onedemo.app.network``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from onedemo.app.http.commands import Actions
 from onedemo.app.http.curves import Curves
 from onedemo.app.http.exports import Downloads
 from onedemo.app.http.invitations import page_address
+from onedemo.app.http.mask_preview import MaskPreview
 from onedemo.app.http.media import Files, Filmed
 from onedemo.app.http.sessions import PERSON, RATER
 from onedemo.app.http.uploads import Uploads
@@ -131,7 +132,7 @@ class Front:
         self._pressed = Places(PRESSES_WAITING, PRESSES_WAITING_EACH)
         self._acted = Places(ACTIONS_WAITING, ACTIONS_WAITING)
         self._health_asked: asyncio.Future[Status] | None = None
-        self._html, self._policy = assets.page_html(), assets.page_policy()
+        self._html, self._policy = assets.page_html(), assets.PAGE_POLICY
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._thread: threading.Thread | None = None
@@ -149,6 +150,7 @@ class Front:
         either = (
             Route("GET", "/static/{name}", "annotator", files.static),
             Route("GET", "/static/vendor/{package}/{name}", "annotator", files.vendored),
+            Route("GET", "/static/viser/{name}", "annotator", files.viser),
             Route("GET", r"/clips/{clip:\d{1,15}}.jpg", "annotator", files.clip),
             Route("GET", r"/pairs/{pair:\d{1,15}}.jpg", "annotator", files.pair),
             Route("GET", r"/demo/frames/{index:\d{1,6}}.jpg", "annotator", files.demo_frame),
@@ -169,6 +171,10 @@ class Front:
             Route("GET", UPLOAD + "/poster.jpg", "researcher", uploads.poster),
             Route("POST", UPLOAD + "/result", "researcher", uploads.bring_in),
             Route("GET", UPLOAD + r"/result-{result:\d{1,6}}.webm", "researcher", uploads.result),
+            Route("POST", UPLOAD + "/mask", "researcher", MaskPreview(uploads).find),
+            Route(
+                "GET", UPLOAD + r"/result-{result:\d{1,6}}-{end:first|last}.jpg", "researcher", uploads.still
+            ),
             Route("POST", UPLOAD + "/keep", "researcher", uploads.keep, "added a demo"),
             Route("POST", UPLOAD + "/discard", "researcher", uploads.discard),
         )

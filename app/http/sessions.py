@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from aiohttp import web
 
-from onedemo.app.http.tokens import hash_token
+from onedemo.app.http.tokens import hash_token, new_session_token
 from onedemo.app.network.bind import Listening
 from onedemo.storage.accounts import SESSION_DAYS
 from onedemo.storage.store import Store
@@ -32,6 +32,8 @@ _T = TypeVar("_T")
 _THREADS = 4
 _TAB_KEPT_S = 600
 """Between the address of a tab and the link that opens it."""
+_NONCE_KEPT_S = 600
+"""Between the page of a link that opens once and the last time its button is pressed."""
 _MOST_VALUES = 4
 """Cookies of one name that are looked at; a browser sends those of the longest path first."""
 _ENDED = {
@@ -105,6 +107,23 @@ class Sessions:
             path=f"{self._listening.base_path}/",
         )
 
+    def put_nonce(self, request: web.Request, response: web.StreamResponse) -> None:
+        """Gives the browser a number by which it is known for a while when it opens a link."""
+        response.set_cookie(
+            self._nonce_name,
+            new_session_token(),
+            max_age=_NONCE_KEPT_S,
+            httponly=True,
+            samesite="Lax",
+            secure=self._listening.encrypted(request),
+            path=f"{self._listening.base_path}/login",
+        )
+
+    def nonce(self, request: web.Request) -> str:
+        """That number, "" if there is none."""
+        kept = next(_values(request, self._nonce_name), "")
+        return kept if re.fullmatch(r"[\w-]{43}", kept, re.ASCII) else ""
+
     def kept_tab(self, request: web.Request) -> str:
         """That tab, "" if there is none."""
         kept = next(_values(request, self._tab_name), "")
@@ -144,6 +163,10 @@ class Sessions:
     @property
     def _tab_name(self) -> str:
         return f"{self._name(None)}-tab"
+
+    @property
+    def _nonce_name(self) -> str:
+        return f"{self._name(None)}-nonce"
 
     def _name(self, rater: int | None) -> str:
         # Browsers share cookies between the ports of a host; two studies on one machine must not.

@@ -52,6 +52,18 @@ def new_session_token() -> str:
     return secrets.token_urlsafe(SECRET_BYTES)
 
 
+def session_token_of(link_token: str, nonce: str) -> str:
+    """The token of the session that a browser gets by a link, if it is to be the same each time.
+
+    Args:
+        link_token: Of the link: nobody else knows it.
+        nonce: What was given to the browser before.
+    """
+    key, text = link_token.encode("utf-8", "surrogateescape"), nonce.encode("utf-8", "surrogateescape")
+    digest = hmac.new(key, b"onedemo session " + text, hashlib.sha256).digest()
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode()
+
+
 def read_secret(data_dir: Path) -> bytes:
     """The secret of a data directory, 32 bytes; made (mode 0600, atomically) if there is none.
 

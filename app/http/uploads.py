@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Iterator
@@ -22,15 +23,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from aiohttp import BodyPartReader, web
 
 from onedemo.app.network.refusals import read_json
 from onedemo.core.directories import Workshop, clear_left_over, make_directory
 from onedemo.core.files import private_opener
 from onedemo.demos.containers import check_file
-from onedemo.demos.import_checks import check_options
-from onedemo.demos.library import demo_picture, keep_demo, known_demo, prepare_demo
-from onedemo.demos.sandboxed_decoder import Look, Options, look
+from onedemo.demos.edits import Options, check_options, read_loop, read_rotation, read_speed
+from onedemo.demos.library import demo_picture, keep_demo, known_demo
+from onedemo.demos.preparing import VIDEO, prepare_demo
+from onedemo.demos.sandboxed_decoder import Look, look
 from onedemo.demos.video import jpeg
 from onedemo.errors import UserError
 
@@ -44,6 +47,13 @@ MOST_WAITING = 4
 """Videos that are neither kept nor discarded; the oldest goes when another comes."""
 WAIT_SECONDS = 3600.0
 """That such a video stays after it was last asked for."""
+_CHOSEN = {"start", "end", "rotate", "stabilise", "crop", "track", "mirror", "speed", "reverse", "loop"}
+_FACTS = ("seconds", "frames", "fps", "width", "height", "edits")
+_CALLED = {
+    "track": "“Follow what moves”", "stabilise": "“Hold the background still”", "speed": "“Speed”",
+    "loop": "“Repeat”", "rotate": "“Turn”",
+}  # fmt: skip
+"""Options of the command line, on the page."""
 
 _T = TypeVar("_T")
 
@@ -54,16 +64,19 @@ class _Upload:
     look: Look
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     end: asyncio.TimerHandle | None = None
-    shown: int = 0
+    tried: int = 0
     """Results so far: each has an address of its own, so that no browser shows an earlier one."""
+    shown: int = 0
+    """The newest that could be made; 0: none so far."""
+    stills: list[bytes] = field(default_factory=list)
+    """Its first and its last frame, JPEG."""
 
     @property
     def video(self) -> Path:
         return self.place.path / "video"
 
-    @property
-    def result(self) -> Path:
-        return self.place.path / f"result-{self.shown}"
+    def result(self, number: int) -> Path:
+        return self.place.path / f"result-{number}"
 
 
 class Uploads:
@@ -142,42 +155,72 @@ class Uploads:
     async def bring_in(self, request: web.Request) -> web.Response:
         """Makes what the demo would be; answers with its facts: JSON.
 
-        Takes ``{"start": s, "end": s, "crop": [x, y, width, height], "mirror": bool}``; each may be null.
+        Takes what ``onedemo.demos.edits.Options`` says, as far as a person chooses it; each may be left out,
+        or null: ``{"start": s, "end": s, "rotate": degrees, "stabilise": bool, "crop": [x, y, width, height],
+        "track": bool, "mirror": bool, "speed": times, "reverse": bool, "loop": times or true}``. What was
+        shown before stays, and can be kept, if this cannot be done.
         """
         async with self._upload(request) as upload:
             with self._at_work(), _sentences("video"), _named(upload.video):
                 options = _options(await read_json(request))
-                shutil.rmtree(upload.result, ignore_errors=True)
-                upload.shown += 1
-                make_directory(upload.result, private=True)
+                upload.tried += 1
+                place = upload.result(upload.tried)
+                make_directory(place, private=True)
                 warnings: list[str] = []
+                ends: list[np.ndarray] = []
+
+                def stored(frame: np.ndarray) -> None:
+                    ends[1:] = [frame]
+
                 work = partial(
-                    prepare_demo, upload.video, options, upload.result, source="uploaded",
-                    warn=warnings.append,
+                    prepare_demo, upload.video, options, place, source="uploaded", warn=warnings.append,
+                    stored=stored,
                 )  # fmt: skip
-                demo = await asyncio.to_thread(work)
+                try:
+                    demo = await asyncio.to_thread(work)
+                except BaseException:
+                    shutil.rmtree(place, ignore_errors=True)
+                    raise
+                shutil.rmtree(upload.result(upload.shown), ignore_errors=True)
+                upload.shown, upload.stills = upload.tried, [jpeg(frame) for frame in ends]
                 known = await asyncio.to_thread(known_demo, demo.sha256, self._demos_dir)
-        facts = {name: getattr(demo, name) for name in ("seconds", "frames", "fps", "width", "height")}
-        said = [f"{sentence[:1].upper()}{sentence[1:]}." for sentence in warnings]
+        facts = {name: getattr(demo, name) for name in _FACTS}
+        said = [_sentence(warning) for warning in warnings]
         about = {"result": upload.shown, "known": known.name if known else None, "warnings": said}
         return web.json_response(facts | about)
+
+    @asynccontextmanager
+    async def result_of(self, request: web.Request) -> AsyncIterator[Path]:
+        """Where what the demo would be lies, for one request at a time that works on it."""
+        async with self._upload(request) as upload:
+            with self._at_work(), _sentences("mask"), _named(upload.result / "video.webm"):
+                if not (upload.result / "demo.json").is_file():
+                    raise ValueError("choose a part and look at the result first")
+                yield upload.result
 
     async def result(self, request: web.Request) -> web.StreamResponse:
         """What the demo would be, as video."""
         async with self._upload(request) as upload:
-            path = upload.result / "video.webm"
+            path = upload.result(upload.shown) / VIDEO
             if request.match_info["result"] != str(upload.shown) or not path.is_file():
                 raise web.HTTPNotFound()
             return web.FileResponse(path, headers={"Content-Type": "video/webm"})
+
+    async def still(self, request: web.Request) -> web.Response:
+        """The first or the last frame of what the demo would be, JPEG."""
+        async with self._upload(request) as upload:
+            if request.match_info["result"] != str(upload.shown) or not upload.stills:
+                raise web.HTTPNotFound()
+            return _picture(upload.stills[0 if request.match_info["end"] == "first" else -1])
 
     async def keep(self, request: web.Request) -> web.Response:
         """Makes it a demo, called as the query's ``name`` says; answers its name, which it may have had."""
         async with self._upload(request) as upload:
             with _sentences("name"):
-                if not (upload.result / "demo.json").is_file():
+                if not upload.shown:
                     raise ValueError("choose a part and look at the result first")
                 name = request.query.get("name", "").strip()
-                work = partial(keep_demo, upload.result, name, self._demos_dir)
+                work = partial(keep_demo, upload.result(upload.shown), name, self._demos_dir)
                 demo = await asyncio.to_thread(work)
         self._end(request.match_info["upload"])
         return web.json_response({"name": demo.name, "known": demo.name != name})
@@ -266,8 +309,7 @@ def _sentences(what: str) -> Iterator[None]:
     try:
         yield
     except (UserError, ValueError) as error:
-        said = str(error).replace("--", "")
-        raise web.HTTPBadRequest(text=f"{said[:1].upper()}{said[1:]}.") from None
+        raise web.HTTPBadRequest(text=_sentence(str(error))) from None
     except OSError as error:
         raise web.HTTPInsufficientStorage(
             text=f"The {what} could not be stored ({error.strerror or error})."
@@ -281,6 +323,12 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except UserError as error:
         raise UserError(str(error).replace(str(path), "the video")) from None
+
+
+def _sentence(said: str) -> str:
+    """What is said of an option of the command line, about what is called otherwise on the page."""
+    said = re.sub(r"--([a-z]+)", lambda option: _CALLED.get(option[1], option[1]), said)
+    return f"{said[:1].upper()}{said[1:]}."
 
 
 def _picture(data: bytes, headers: dict[str, str] | None = None) -> web.Response:
@@ -298,8 +346,8 @@ def _seconds(value: Any, name: str) -> float:
 
 
 def _options(body: Any) -> Options:
-    if not isinstance(body, dict) or not set(body) <= {"start", "end", "crop", "mirror"}:
-        raise ValueError("a part of a video has start, end, crop and mirror")
+    if not isinstance(body, dict) or not set(body) <= _CHOSEN:
+        raise ValueError(f"a part of a video has {', '.join(sorted(_CHOSEN))}")
     start, end = (None if body.get(name) is None else _seconds(body[name], name) for name in ("start", "end"))
     given, crop = body.get("crop"), None
     if given is not None:
@@ -307,5 +355,12 @@ def _options(body: Any) -> Options:
             raise ValueError("the part of the picture is four whole numbers: x, y, width, height")
         x, y, width, height = (max(-1, min(side, 1 << 20)) for side in given)
         crop = (x, y, width, height)
-    check_options(start=start, end=end, crop=crop, fps=30.0)
-    return Options(start=start, end=end, crop=crop, mirror=body.get("mirror") is True)
+    numbers = {
+        name: read(body[name])
+        for name, read in (("speed", read_speed), ("loop", read_loop), ("rotate", read_rotation))
+        if body.get(name) is not None
+    }
+    switches = {name: body.get(name) is True for name in ("mirror", "reverse", "track", "stabilise")}
+    options = Options(start=start, end=end, crop=crop, **numbers, **switches)
+    check_options(options)
+    return options

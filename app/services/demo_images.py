@@ -65,7 +65,10 @@ class Pictures:
         self._read = read
         self._track, self._choosing = track, threading.Lock()
         self._shown = shipped_track(demo)
-        self._others = {d.name: d for d in built_in() if d.fps == demo.fps and d.path != demo.path}
+        self._others = {
+            d.name: d for d in built_in()
+            if d.fps == demo.fps and d.path != demo.path and d.robot == self._robot.name
+        }  # fmt: skip
         self._length = min(demo.frames, max(2, round(_CLIP_SECONDS * demo.fps)))
         self._chosen: Examples | None = None
         self._lock = threading.Lock()
@@ -104,7 +107,7 @@ class Pictures:
                 self._shown = self._shown or self._track()
                 tracks = {name: shipped_track(demo) for name, demo in self._others.items()}
                 others = {name: track for name, track in tracks.items() if track is not None}
-                self._chosen = choose(self._shown, self.demo.frames, self._length, others)
+                self._chosen = choose(self._shown, self.demo.frames, self._length, others, self._robot)
             return self._chosen
 
     def _prepare(self) -> None:

@@ -30,7 +30,8 @@ from onedemo.types import Demo
 from onedemo.vision.encoders import make_encoder
 
 OFFERED = (
-    "ratings.pretrain", "ratings.online", "rollouts.total_steps", "ratings.clip_seconds", "ratings.choice",
+    "env", "ratings.pretrain", "ratings.online", "rollouts.total_steps", "ratings.clip_seconds",
+    "ratings.choice",
 )  # fmt: skip
 """Settings that a new run may be given in the browser, besides method and seed. The others are as in the
 run at hand."""

@@ -11,6 +11,7 @@ from typing import Any
 from onedemo.app.annotation import presses
 from onedemo.app.annotation.comparison_session import ComparisonSession
 from onedemo.app.annotation.phases import waiting_for_pairs
+from onedemo.app.annotation.scale import PAIR_REASONS
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.tabs.pressing import Pressing
 from onedemo.app.tabs.strings import COMPARE_KEYS, keys_dialog
@@ -22,7 +23,7 @@ class Compare(Pressing):
     """The Compare tab of one session."""
 
     title = "Compare"
-    takes = (presses.Compare,)
+    takes = (presses.Compare, presses.ExplainPair)
 
     def __init__(self, context: TabContext) -> None:
         super().__init__(context.client)
@@ -63,12 +64,17 @@ class Compare(Pressing):
         self._comparing.close()
 
     def _carry_out(self, press: Any) -> bool:
-        if press.answer == "undo":
-            return self._comparing.undo(press.pair)
-        return self._comparing.answer(press.pair, press.answer)
+        match press:
+            case presses.ExplainPair():
+                return self._comparing.explain(press.pair, press.reason.strip())
+            case presses.Compare(answer="undo"):
+                return self._comparing.undo(press.pair)
+            case _:
+                return self._comparing.answer(press.pair, press.answer)
 
     def _draw(self) -> None:
-        context, pair, undoable = self._context, self._comparing.current, self._comparing.undoable
+        context, comparing = self._context, self._comparing
+        pair, undoable = comparing.current, comparing.undoable
         shown = pair is not None
         undo = {"data-undo-pair": undoable} if undoable else None
         with self._client.atomic():
@@ -78,15 +84,16 @@ class Compare(Pressing):
             if shown:
                 stage = render(
                     "compare.html:pair", number=pair, source=self._address(pair),
-                    ahead=self._address(self._comparing.upcoming), fps=context.demo.fps,
+                    ahead=self._address(comparing.upcoming), fps=context.demo.fps,
                 )  # fmt: skip
             else:
                 told = waiting_for_pairs(self._status, researcher=context.rater.role == "researcher")
                 stage = render("parts.html:waiting", told=told)
             self._put(self._stage, stage)
             notice = render(
-                "compare.html:notice", skipped=self._comparing.skipped, taken_back=self._comparing.taken_back
-            )
+                "compare.html:notice", skipped=comparing.skipped, explained=comparing.explained,
+                taken_back=comparing.taken_back, reasons=PAIR_REASONS,
+            )  # fmt: skip
             self._put(self._notice, notice)
             self._put(self._answers, render("compare.html:answers") if shown else "")
             self._put(self._tools, render("player.html:tools", kind="compare" if shown else "", undo=undo))

@@ -30,11 +30,11 @@ class Rate(Pressing):
     def __init__(self, context: TabContext) -> None:
         super().__init__(context.client)
         self._context, self._lesson = context, context.lesson
+        self._status: Status = context.training.status()
         self._rating = RatingSession(
             context.store, context.run, context.rater, context.assignment, context.client.client_id,
-            dt=context.dt, demo=context.demo, guard_seconds=context.guard_seconds,
+            dt=context.dt, demo=context.demo, guard_seconds=context.guard_seconds, wanted=self._wanted,
         )  # fmt: skip
-        self._status: Status = context.training.status()
         gui = context.client.gui
         self._notice, self._top = gui.add_html(""), gui.add_html("")
         self._stage = gui.add_html("")
@@ -68,6 +68,10 @@ class Rate(Pressing):
     def close(self) -> None:
         """Frees the clips for others."""
         self._rating.close()
+
+    def _wanted(self) -> int:
+        used = self._context.store.ratings.count_for_training(self._context.run)
+        return self._status.asked_ratings - used
 
     def _look(self) -> None:
         if self._lesson.over:

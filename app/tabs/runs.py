@@ -20,8 +20,10 @@ from onedemo.app.tabs import charts
 from onedemo.app.tabs.context import TabContext
 from onedemo.app.templates import render
 from onedemo.config import METHODS, RunConfig, describe
+from onedemo.demos.edits import USEFUL_SECONDS
 from onedemo.demos.library import list_demos
 from onedemo.queries.settings import CHOICES
+from onedemo.robots.registry import names
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Demo, Status
 
@@ -63,7 +65,9 @@ class Runs:
         gui.add_html(
             str(
                 render(
-                    "runs.html:new_run", demos=[demo.name for demo in list_demos(self._demos_dir)],
+                    "runs.html:new_run",
+                    demos=[(demo.name, demo.robot) for demo in list_demos(self._demos_dir)],
+                    robots=names(), robot=settings_of(config)["env"],
                     methods=list(METHODS), runs=[run["id"] for run in reversed(runs)],
                     fields=fields_of(config), choices=list(CHOICES), said=_meanings(),
                 )
@@ -72,7 +76,7 @@ class Runs:
         self._demos = gui.add_html("")
         dialogs = (
             render("runs.html:edit_run"), render("runs.html:edit_demo"),
-            render("runs.html:new_demo", megabytes=LARGEST >> 20),
+            render("runs.html:new_demo", megabytes=LARGEST >> 20, useful=USEFUL_SECONDS),
         )  # fmt: skip
         gui.add_html(f'<div class="od-dialogs">{"".join(map(str, dialogs))}</div>')
 
@@ -213,7 +217,8 @@ def _line(run: Mapping[str, Any], figures: Mapping[str, Any], status: Status | N
         act_words = "Try again" if status.phase == "failed" else act.capitalize()
     return {
         "name": run["id"], "title": run["title"], "note": run["note"], "demo": run["demo"],
-        "method": settings["method"], "seed": run["seed"], "here": status is not None, "state": state,
+        "robot": settings["env"], "method": settings["method"], "seed": run["seed"],
+        "here": status is not None, "state": state,
         "state_words": words, "why": status.error if status is not None and state == "failed" else "",
         "ratings": figures["ratings"], "comparisons": figures["comparisons"], "env_steps": steps,
         "total_steps": total, "predicted": figures.get("predicted"),
@@ -261,6 +266,7 @@ def settings_of(config: str) -> dict[str, Any]:
     usual = RunConfig()
     flat = {
         "method": "paper" if config.strip() else usual.method,
+        "env": usual.env,
         "rollouts.total_steps": usual.rollouts.total_steps,
         **{
             f"ratings.{name}": getattr(usual.ratings, name) for name in ("pretrain", "online", "clip_seconds")

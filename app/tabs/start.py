@@ -102,7 +102,8 @@ class Start:
                 self._best = row
         outside = {rater.name for rater in everybody if rater.id in left_out}
         steps = render(
-            "start.html:steps", run=run, demo=self._context.demo.name, status=status, people=people,
+            "start.html:steps", run=run, demo=self._context.demo.name, robot=self._context.live.robot.name,
+            status=status, people=people,
             given=[(name, count) for name, count in given.most_common() if name not in outside],
             left_out=sum(given[name] for name in outside), best=self._best, halted=status.phase in HALTED,
             version=self._context.version, picture=self._context.demo.sha256[:8], me=self._context.rater.id,

@@ -8,7 +8,7 @@ Keys = tuple[tuple[tuple[str, ...], str], ...]
 _PLAYING: Keys = (
     (("Space",), "play it again from the start"),
     (("F",), "slow motion, on and off"),
-    (("T",), "first pose and paths of head and foot, on and off"),
+    (("T",), "first pose and paths through the clip, on and off"),
     (("←", "→"), "one frame back or forward"),
 )
 _HELP: Keys = ((("?",), "show these keys"),)
@@ -25,7 +25,7 @@ COMPARE_KEYS: Keys = (
     (("2",), "about the same"),
     (("3",), "the right one is closer to the video"),
     (("U",), "undo your last answer, and those before it (also Backspace)"),
-    (("S",), "skip these two"),
+    (("S",), "skip these two; you may say why"),
     *_PLAYING,
     *_HELP,
 )

@@ -9,12 +9,11 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 from markupsafe import Markup
-from mjviser import ViserMujocoScene
 
 from onedemo.app.annotation.phases import NAMES, told
 from onedemo.app.annotation.scale import ANSWERS
@@ -28,6 +27,9 @@ from onedemo.robots.camera import Camera, visible_geoms
 from onedemo.robots.robot import Robot
 from onedemo.storage.rating_counts import Counts
 from onedemo.types import HALTED, Status
+
+if TYPE_CHECKING:
+    from mjviser import ViserMujocoScene
 
 _DEMO_HZ = 15.0
 """How often the demo's frame is exchanged; the robot moves twice as often."""
@@ -166,6 +168,8 @@ class Watch:
     # The robot
 
     def _build_scene(self) -> None:
+        from mjviser import ViserMujocoScene  # 0.4 s, for who sees the robot
+
         camera = self._live.robot.camera
         # A model of its own, as the scene writes into it; without the floor, which is drawn calmer here.
         scene = ViserMujocoScene(self._client, drawn_model(self._live.robot), num_envs=1)  # type: ignore[arg-type]

@@ -12,6 +12,8 @@ pytestmark = pytest.mark.seam
 OURS = {"include": [["[class^='od-']:not([class^='od-'] *)"]]}
 """The outermost elements of ours: axe looks at all that is in them, and compares each with each of these."""
 
+BRIEF = {"resultTypes": ["violations"]}
+
 
 def assert_nothing_serious(page, where: str) -> None:
     # Colours on their way from one scheme to the other have any contrast.
@@ -22,11 +24,20 @@ def assert_nothing_serious(page, where: str) -> None:
     )
     found = [
         (violation["id"], node["target"], node.get("failureSummary", "")[:200])
-        for violation in Axe().run(page, context=OURS).response["violations"]
+        for violation in Axe().run(page, context=OURS, options=BRIEF).response["violations"]
         if violation["impact"] in ("serious", "critical")
         for node in violation["nodes"]
     ]
     assert not found, (where, found)
+
+
+DIALOGS = {
+    "Start": (("[data-revoke]", ".od-sure[open]"), (".od-account", ".od-menu:popover-open")),
+    "Watch": (("[data-film]", ".od-film[open]"),),
+    "Runs": (("[data-edit-run]", ".od-dialog[open]"),),
+    "Data": ((".od-given >> text=Look", ".od-review[open] [data-frame]"),),
+}
+"""Of a tab: what opens each, and how it is known to be open."""
 
 
 @pytest.mark.parametrize(
@@ -70,6 +81,12 @@ def test_nothing_serious_on_any_tab(chromium, site, viewport, scheme):
                 page.click("text=Make links")
                 page.wait_for_selector(".od-links svg", state="attached")
             assert_nothing_serious(page, tab)
+            for opens, shown in DIALOGS.get(tab, ()):
+                page.locator(opens).first.click()
+                page.wait_for_selector(shown)
+                assert_nothing_serious(page, shown)
+                page.keyboard.press("Escape")
+                page.wait_for_selector(shown, state="hidden")
         shown_clip(page)
         press_and_wait(page, site, lambda: page.keyboard.press("s"))
         page.wait_for_selector(".od-notice")

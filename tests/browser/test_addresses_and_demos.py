@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import cv2
+import numpy as np
 import pytest
 from data.videos import corners_of, encode, number_of
 
+from browser.test_accessible import assert_nothing_serious
 from browser.test_page import DESKTOP, PHONE, SMALL, opened, until
 from helpers.fake_trainer import _zeros, drawn_frames
 from onedemo.demos.library import find_demo, list_demos, read_frames
@@ -130,6 +133,8 @@ def test_a_video_is_trimmed_cropped_looked_at_kept_and_learned_from(chromium, si
         facts = dict(zip(terms, values, strict=True))
         assert facts["Length"] == "1.80 s" and facts["Frames"] == "54" and facts["Size"].startswith("240 x ")
         page.wait_for_function("() => document.querySelector('[data-part=result]').currentTime > 0.1")
+        assert_nothing_serious(page, "the result")
+        follows_each_change(page, part)
         assert [demo for demo in list_demos(demos_dir) if demo.source == "uploaded"] == []
         assert part("name").input_value() == "a-turning-stick"
         part("name").fill("a stick")
@@ -171,11 +176,13 @@ def test_a_video_is_trimmed_cropped_looked_at_kept_and_learned_from(chromium, si
             None,
         )
         assert wanted["settings"] == {
-            "ratings.pretrain": 12, "ratings.online": 150, "rollouts.total_steps": 10_000_000,
+            "env": "hopper", "ratings.pretrain": 12, "ratings.online": 150,
+            "rollouts.total_steps": 10_000_000,
             "ratings.clip_seconds": 0.5, "ratings.choice": "high",
         }  # fmt: skip
         # The library: renamed, and removed after a question.
         page.click('[data-edit-demo="stick"]', timeout=20_000)
+        assert_nothing_serious(page, "a demo")
         page.fill(".od-dialog [name=name]", "twig")
         page.click(".od-dialog >> text=Rename")
         page.click('[data-edit-demo="twig"]', timeout=20_000)
@@ -185,6 +192,7 @@ def test_a_video_is_trimmed_cropped_looked_at_kept_and_learned_from(chromium, si
         assert not demo.path.exists()
         # A title and a note.
         page.click(f'[data-edit-run="{site.trainer.run}"]')
+        assert_nothing_serious(page, "a run")
         page.fill(".od-dialog [name=title]", "First <b>try</b>")
         page.fill(".od-dialog [name=note]", "Two raters.")
         page.click(".od-dialog >> text=Save")
@@ -211,12 +219,65 @@ def test_a_video_is_trimmed_cropped_looked_at_kept_and_learned_from(chromium, si
         assert page.locator(".od-dialog [data-delete]").is_hidden()
 
 
+def preview(page):
+    """Address of the preview, once it is that of what is chosen, with its two stills."""
+    page.wait_for_function(
+        "() => !document.querySelector('.od-making') &&"
+        " ['first', 'last'].every(end => document.querySelector(`[data-part=${end}]`).naturalWidth)"
+    )
+    return page.locator("[data-part=result]").get_attribute("src")
+
+
+def number_in(page, part, end):
+    """What the browser shows of an end of the preview, as a picture."""
+    data = page.request.get(part(end).evaluate("image => image.src")).body()
+    return cv2.imdecode(np.frombuffer(data, np.uint8), 1)[..., ::-1]
+
+
+def follows_each_change(page, part):
+    """What cannot be done is said, undone, and loses nothing; the video is not sent again."""
+    sent = []
+    page.on("request", lambda request: sent.append(request.url) if request.url.endswith("/demos") else None)
+    told = "document.addEventListener('demo-result', event => window.told = event.detail, { once: true })"
+    before, first, last = preview(page), number_in(page, part, "first"), number_in(page, part, "last")
+    page.evaluate(told)
+    part("speed").fill("2")
+    part("reverse").check()
+    part("loop").select_option("3")
+    page.wait_for_function("() => document.querySelector('[data-part=facts]').innerText.includes('2.70 s')")
+    after = preview(page)
+    assert after != before and part("facts").locator("dd").all_inner_texts()[1] == "81"
+    assert abs(number_in(page, part, "last").astype(int) - first).mean() < 6
+    assert (
+        abs(number_in(page, part, "first").astype(int) - last).mean() < abs(first.astype(int) - last).mean()
+    )
+    assert page.evaluate("told.options.speed") == 2 and page.evaluate("told.place").startswith("demos/")
+    for wrong in ("0", "-1", "21", ""):
+        part("speed").fill(wrong)
+        assert part("speed-wrong").inner_text() == "The speed is a number from 0.1 to 20."
+        assert part("keep-it").is_disabled()
+    part("speed").fill("2")
+    part("loop").select_option("10")
+    page.wait_for_function("() => document.querySelector('[data-part=facts]').innerText.includes('9.00 s')")
+    part("stabilise").focus()
+    page.keyboard.press("Space")  # a stick before a sky: there is nothing to hold on to
+    page.wait_for_selector("[data-part=edits-wrong] >> text=“Hold the background still” finds no background")
+    assert not part("stabilise").is_checked() and part("loop").input_value() == "10"
+    assert part("keep-it").is_enabled() and preview(page)
+    part("speed").fill("1")
+    part("reverse").uncheck()
+    part("loop").select_option("1")
+    page.wait_for_function("() => document.querySelector('[data-part=facts]').innerText.includes('1.80 s')")
+    assert preview(page) and part("edits-wrong").inner_text() == "" and sent == []
+
+
 def test_a_video_that_the_browser_cannot_play_is_shown_by_the_server_and_used(chromium, site, tmp_path):
     file = tmp_path / "move.mov"
     encode(file, "prores_ks", frames=40, pix_fmt="yuv422p10le", size=(320, 240))
-    with opened(chromium, site.links["researcher"], PHONE) as page:
+    with opened(chromium, site.links["researcher"], PHONE, color_scheme="dark") as page:
         page.click(".od-tabs >> text=Runs")
         page.click("[data-new-demo]")
+        assert_nothing_serious(page, "which video")
         page.set_input_files("[data-part=file]", str(file))
         page.wait_for_selector(".od-form-note:visible >> text=This browser cannot play the video.")
         page.wait_for_function(
@@ -227,13 +288,35 @@ def test_a_video_that_the_browser_cannot_play_is_shown_by_the_server_and_used(ch
             for _ in range(10):
                 page.keyboard.press("ArrowRight")
         assert given.value.status == 200
-        page.check("[data-part=mirror]")
+        page.click("[data-press=turn]")
+        box = page.locator("[data-part=frame]").bounding_box()
+        assert box["width"] / box["height"] == pytest.approx(240 / 320, abs=0.02)
+        assert page.input_value("[data-part=crop-w]") == "240"
+        assert_nothing_serious(page, "which part")
         page.click("[data-part=show]")
         page.wait_for_selector("[data-step=result]:visible", timeout=60_000)
+        page.check("[data-part=mirror]")
+        page.select_option("[data-part=loop]", "fill")
+        page.wait_for_function(
+            "() => document.querySelector('[data-part=facts]').innerText.includes('240\\n')", timeout=60_000
+        )
+        preview(page)
+        sizes = page.evaluate(
+            "() => [...document.querySelectorAll('[data-step=result] :is(button, input, select)')]"
+            ".map(each => (each.type === 'checkbox' ? each.closest('label') : each).offsetHeight)"
+        )
+        assert min(sizes) >= 40, sizes
+        assert page.evaluate("() => document.querySelector('dialog[open]').scrollWidth") <= PHONE["width"]
+        assert_nothing_serious(page, "the result")
         page.fill("[data-part=name]", "mov")
         page.click("text=Keep")
         page.wait_for_selector("text=mov is a demo now.")
-        frames = read_frames(find_demo("mov", site.trainer.data_dir / "demos"))
-        assert len(frames) == 30 and corners_of(frames[0]) == "GR/YB"
-        assert number_of(frames[0][:, ::-1]) == 10
+        demo = find_demo("mov", site.trainer.data_dir / "demos")
+        frames = read_frames(demo)
+        assert len(frames) == 240 and corners_of(frames[0]) == "RB/GY"
+        assert [number_of(np.rot90(frames[k][:, ::-1])) for k in (0, 29, 30)] == [10, 39, 10]
+        done = "turned by 90°, mirrored, repeated to fill 8 s"
+        assert demo.edits == f"from 0.333333 s on, {done}"
+        page.click("[data-press=close]")
+        page.wait_for_selector(f"[data-demo=mov] [data-edits] >> text={done}", timeout=20_000)
         until(lambda: list((site.trainer.data_dir / "uploads").iterdir()) == [])

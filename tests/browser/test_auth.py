@@ -20,6 +20,7 @@ from helpers.beside_playwright import run
 from helpers.paths import ROOT
 from load.annotators import browser_session, open_tab
 from onedemo.app.cli.main import main
+from onedemo.app.http import viser_proxy
 from onedemo.app.http.tokens import hash_token, passing_link, read_span
 from onedemo.app.http.viser_protocol import known
 from onedemo.app.network.bind import Listening
@@ -140,7 +141,8 @@ def test_a_link_that_opens_once_opens_once_and_for_nobody_who_only_looks(site):
     token = link.split("token=")[1]
     for _ in range(3):  # mail scanners and previews
         status, headers, text = ask(site.url, link)
-        assert status == 200 and "Your link works only once" in text and "Set-Cookie" not in headers
+        assert status == 200 and "Your link works only once" in text
+        assert re.match(r"onedemo-\d+-nonce=.*; Path=/login;", headers["Set-Cookie"])  # that lets nobody in
         assert ask(site.url, link, method="HEAD")[0] == 405
     elsewhere = {"Origin": "http://elsewhere.example"}
     assert ask(site.url, "/login", method="POST", data={"token": token}, headers=elsewhere)[0] == 403
@@ -210,8 +212,13 @@ def test_links_are_listed_and_revoked_one_by_one(tmp_path, capsys):
 
 
 @pytest.mark.seam
-def test_revoking_ends_open_pages_within_two_seconds(site):
-    store = site.trainer.store
+def test_revoking_ends_open_pages_within_two_seconds(site, monkeypatch):
+    """By looks, each a second after the one before: how long that is on a busy machine, nobody knows."""
+    store, looks = site.trainer.store, []
+    ended = store.accounts.ended_sessions
+    monkeypatch.setattr(
+        store.accounts, "ended_sessions", lambda sessions: looks.append(ended(sessions)) or looks[-1]
+    )
 
     async def go():
         async with browser_session() as session:
@@ -219,21 +226,23 @@ def test_revoking_ends_open_pages_within_two_seconds(site):
             for tab in (bo, cy):
                 await tab.until(lambda tab=tab: tab.clip, "a clip")
             began = time.monotonic()
+            before = len(looks)
             await asyncio.to_thread(
                 store.accounts.revoke_tokens, next(r.id for r in store.accounts.raters() if r.name == "bo")
             )
             while not bo.socket.closed:
-                assert time.monotonic() < began + 10, "the page stays open"
+                assert time.monotonic() < began + 60, "the page stays open"
                 await asyncio.sleep(0.05)
-            taken = time.monotonic() - began
+            seen = [bool(look) for look in looks[before:]]
             await cy.rate(3)  # nobody else's
             code = bo.socket.close_code
             for tab in (bo, cy):
                 await tab.close()
-            return taken, code
+            return seen, code
 
-    taken, code = run(go())
-    assert taken < 3 and code == 1008
+    seen, code = run(go())
+    # One look may have been under way; the next one sees it.
+    assert seen.index(True) <= 1 and viser_proxy._LOOK_S <= 1 and code == 1008
     assert len(site.events()) == 1
 
 

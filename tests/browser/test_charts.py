@@ -37,15 +37,17 @@ def lines_drawn(page, charts: int = 2) -> None:
         raise AssertionError(f"coloured pixels: {page.evaluate(PAINTED)}") from None
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_charts_show_their_lines_at_each_load_resize_and_reconnect(chromium, site, scheme):
+def test_charts_show_their_lines_at_each_load_resize_and_reconnect_in_both_schemes(chromium, site):
     store, run = site.trainer.store, site.trainer.run
     train(store, run, 1, 40)
     site.trainer.set_status(phase="online", iteration=40)
     number = 40
-    with opened(chromium, site.links["researcher"], SMALL, color_scheme=scheme) as page:
-        for load in range(6 if scheme == "light" else 2):
-            if load:
+    with opened(chromium, site.links["researcher"], SMALL, color_scheme="light") as page:
+        for load in ("first", "again", "dark", "again"):
+            if load == "dark":
+                with page.expect_navigation():  # by itself
+                    page.emulate_media(color_scheme="dark")
+            elif load == "again":
                 page.reload()
             page.wait_for_selector(".uplot", timeout=60_000)
             lines_drawn(page)
@@ -58,10 +60,11 @@ def test_charts_show_their_lines_at_each_load_resize_and_reconnect(chromium, sit
             page.wait_for_timeout(300)
             lines_drawn(page)
         page.set_viewport_size(SMALL)
+        name = page.locator(".od-header").get_attribute("data-page")
         for client in list(site.page._server.get_clients()):  # the connection goes; Viser comes back
             hang_up(site.page._server, client)
         train(store, run, number + 1, number + 1)
-        page.wait_for_timeout(1500)
+        page.wait_for_selector(f'.od-header:not([data-page="{name}"])', timeout=60_000)
         page.wait_for_selector(".uplot", timeout=60_000)
         lines_drawn(page)
 
@@ -70,7 +73,8 @@ def series_colours(page) -> dict[str, str]:
     """The colour of each run in the first chart's legend."""
     return page.evaluate(
         """() => {
-          const items = [...document.querySelector(".od-chart").querySelectorAll(".od-legend-of-chart span")];
+          const chart = document.querySelector(".od-chart");
+          const items = [...(chart?.querySelectorAll(".od-legend-of-chart span") ?? [])];
           return Object.fromEntries(items.map((item) => [item.childNodes[1].textContent.trim(),
             item.querySelector("i").style.color]));
         }"""
@@ -130,6 +134,43 @@ def test_a_chart_tells_values_zooms_smooths_and_marks(chromium, site):
         page.locator(f'[data-compare="{run}"]').click()
         until(lambda: set(series_colours(page)) == {"hop-1"})
         assert series_colours(page)["hop-1"] == colours["hop-1"]
+        # The address says what is compared, so that a reload and a link show the same; a title is shown.
+        assert page.evaluate("() => location.hash") == "#compare=hop-1"
+        store.runs.describe("hop-1", title="The <b>second</b> try", note="")
+        page.reload()
+        until(lambda: set(series_colours(page)) == {"The <b>second</b> try"})
+        assert page.evaluate("() => location.hash") == "#compare=hop-1"
+        both = page.url.partition("#")[0] + f"#compare={run},hop-1"
+        page.goto("about:blank")
+        page.goto(both)
+        until(lambda: set(series_colours(page)) == {run, "The <b>second</b> try"})
+        over = page.locator(".od-comparison .u-over").first
+        over.hover()
+        page.wait_for_selector(".od-comparison .od-tip >> text=the demo itself")
+        page.click('.od-tabs >> text="Data"')
+        page.wait_for_url("**/data")
+        page.click('.od-tabs >> text="Runs"')
+        page.wait_for_url(f"**/runs#compare={run},hop-1")
+        page.click("text=Clear")
+        page.wait_for_selector("text=No run is drawn.")
+        assert page.evaluate("() => location.hash") == "#compare="
+        page.click("text=The newest ones")
+        until(lambda: series_colours(page).keys() == {run, "The <b>second</b> try"})
+        assert page.evaluate("() => location.hash") == ""
+
+
+def test_a_chart_says_that_it_is_loading_until_it_knows_that_there_is_nothing(chromium, site):
+    said = []
+
+    def late(route):
+        said.append(page.locator(".od-chart .od-nothing").first.inner_text())
+        route.continue_()
+
+    with opened(chromium, site.links["researcher"], DESKTOP) as page:
+        page.route("**/curves.json*", late)
+        page.click('.od-tabs >> text="Watch"')
+        page.wait_for_selector(".od-chart >> text=From the first iteration on.")
+        assert said[0] == "Loading…"
 
 
 def test_rollouts_stay_where_they_are_and_a_film_has_its_size_before_it_comes(chromium, site):

@@ -29,7 +29,8 @@ SEEN = {
 }  # fmt: skip
 INSIDE = {"chip": "notice", "reason": "notice", "next": "feedback"}
 """What stands in something else that is measured."""
-MEASURE = """async names => {
+MEASURE = """async ([names, width, height]) => {
+  while (innerWidth !== width || innerHeight !== height) await new Promise(requestAnimationFrame);
   await new Promise(go => requestAnimationFrame(() => requestAnimationFrame(go)));
   const panel = document.querySelector('.mantine-Paper-root:has(.od-header)');
   const shown = e => e.checkVisibility({ visibilityProperty: true }) && e.getBoundingClientRect().width > 0;
@@ -46,8 +47,7 @@ MEASURE = """async names => {
 
 def measured(page, size):
     page.set_viewport_size({"width": size[0], "height": size[1]})
-    page.wait_for_function("([w, h]) => innerWidth === w && innerHeight === h", arg=list(size))
-    said = page.evaluate(MEASURE, SEEN)
+    said = page.evaluate(MEASURE, [SEEN, *size])
     found: dict[str, list] = {}
     for name, *box in said["boxes"]:
         found.setdefault(name, []).append(box)

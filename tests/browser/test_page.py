@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -210,19 +210,32 @@ def test_no_tab_is_wider_than_the_screen(chromium, site):
         site.trainer.run, 1, snapshot=1, env_steps=16_000, stats={"predicted": 2.0, "best": 2.5}
     )
     with opened(chromium, site.links["researcher"]) as page:
-        for tab, content in (
-            ("Rate", ".od-clip"),
-            ("Runs", ".od-new-run"),
-            ("Compare", ".od-pair [data-frame]"),
-            ("Data", ".od-quality"),
-            ("Guide", ".od-example [data-frame]"),
-            ("Watch", ".od-gallery img"),
-        ):
-            page.click(f'.od-tabs >> text="{tab}"')
-            page.wait_for_selector(content, timeout=60_000)
-            for viewport in (DESKTOP, PHONE):
-                page.set_viewport_size(viewport)
+        for viewport in (DESKTOP, PHONE):  # not within a tab: Viser makes all anew where a phone begins
+            page.set_viewport_size(viewport)
+            for tab, content in (
+                ("Rate", ".od-clip"),
+                ("Runs", ".od-new-run"),
+                ("Compare", ".od-pair [data-frame]"),
+                ("Data", ".od-quality"),
+                ("Guide", ".od-example [data-frame]"),
+                ("Watch", ".od-gallery img"),
+            ):
+                page.click(f'.od-tabs >> text="{tab}"')
+                page.wait_for_selector(content, timeout=60_000)
                 assert settled(page, RIGHT) <= viewport["width"], (tab, viewport)
+
+
+def test_a_browser_without_webgl_is_told(chromium, site):
+    context = chromium.new_context()
+    page = context.new_page()
+    page.add_init_script(
+        "const any = HTMLCanvasElement.prototype.getContext;"
+        " HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        " return kind.startsWith('webgl') ? null : any.call(this, kind, ...more) }"
+    )
+    page.goto(site.links["annotator"])
+    assert "needs WebGL" in page.wait_for_selector(".od-nowebgl", timeout=60_000).inner_text()
+    context.close()
 
 
 def test_held_key_gives_one_rating(chromium, site):
@@ -325,6 +338,7 @@ def test_waiting_thanks_failure_and_a_database_that_cannot_write(chromium, site,
         page.wait_for_selector("text=Thank you")
 
 
+@pytest.mark.parametrize("live_fps", [2.0])
 def test_researcher_sees_the_robot_move(chromium, site):
     with opened(chromium, site.links["researcher"], SMALL) as page:
         page.click('.od-tabs >> text="Watch"')
@@ -348,19 +362,24 @@ def test_researcher_sees_the_robot_move(chromium, site):
         until(lambda: site.trainer.calls == ["pause"])
         page.click(".od-controls >> text=Resume")
         until(lambda: site.trainer.calls == ["pause", "resume"])
-        page.click(".od-controls >> text=Stop")
-        page.click(".od-controls >> text=Press again to stop")
+        for _ in range(10):
+            page.click(".od-controls >> text=Stop")
+            with suppress(Error):  # it may be confirmed for five seconds, which a busy machine lets pass
+                page.click(".od-controls >> text=Press again to stop", timeout=5000)
+                break
         until(lambda: site.trainer.calls == ["pause", "resume", "stop"])
 
 
-@pytest.mark.parametrize("viewport", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_everything_needed_to_rate_is_on_one_screen(chromium, site, viewport):
-    with opened(chromium, site.links["annotator"], viewport) as page:
-        shown_clip(page)
-        for selector in (".od-rate-top", ".od-clip", ".od-answers", ".od-sliding", ".od-tools"):
-            box = page.locator(selector).bounding_box()
-            assert box["x"] >= 0 and box["x"] + box["width"] <= viewport["width"], selector
-            assert box["y"] >= 0 and box["y"] + box["height"] <= viewport["height"], selector
+def test_everything_needed_to_rate_is_on_one_screen(chromium, site):
+    with opened(chromium, site.links["annotator"]) as page:
+        for viewport in (DESKTOP, PHONE):
+            page.set_viewport_size(viewport)
+            shown_clip(page)
+            assert settled(page, RIGHT) <= viewport["width"]
+            for selector in (".od-rate-top", ".od-clip", ".od-answers", ".od-sliding", ".od-tools"):
+                box = page.locator(selector).bounding_box()
+                assert box["x"] >= 0 and box["x"] + box["width"] <= viewport["width"], selector
+                assert box["y"] >= 0 and box["y"] + box["height"] <= viewport["height"], selector
 
 
 def test_closed_page_frees_its_clip(chromium, site):

@@ -259,8 +259,12 @@ def test_pairs_are_compared_with_the_keys_of_ratings(chromium, site):
         page.wait_for_selector(f'[data-pair="{expected[-1][0]}"]')
         assert shown() == expected[-1][0]
         page.keyboard.press("s")
-        until(lambda: page.locator(f'[data-pair="{expected[-1][0]}"]').count() == 0)
+        until(lambda: page.locator(f'.od-player[data-pair="{expected[-1][0]}"]').count() == 0)
         assert answers() == expected[:-1]
+        page.click(".od-notice >> text=Too short to tell")
+        page.wait_for_selector(".od-notice >> text=Noted. Thank you.")
+        skipped = site.trainer.store.database.rows("SELECT reason FROM comparisons WHERE answer = 'skip'")
+        assert skipped == [(None,), ("Too short to tell",)]
         assert "pairs" in site.trainer.calls and site.events() == []
         bottom = page.locator(".od-tools").bounding_box()
         assert bottom["y"] + bottom["height"] <= DESKTOP["height"]

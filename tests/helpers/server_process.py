@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from contextlib import ExitStack
 from pathlib import Path
+
+from helpers import warm
 
 
 class Serving:
     """Starts servers on one data directory and ends them all at last."""
 
+    begin = staticmethod(warm.begin)
+
     def __init__(self, data_dir: Path) -> None:
         self.data_dir = data_dir
         self._stack = ExitStack()
 
-    def start(self, *options: str) -> tuple[subprocess.Popen, dict[str, str], Path]:
+    def start(self, *options: str) -> tuple[warm.Child, dict[str, str], Path]:
         """The process, its links once it is ready (none if it ends before), and what it says on stderr."""
         log = self.data_dir.with_name(f"{self.data_dir.name}.log")
-        errors = self._stack.enter_context(log.open("w"))
-        command = [
-            sys.executable,
-            "-m",
-            "onedemo.app.cli",
-            "serve",
-            "--data-dir",
-            str(self.data_dir),
-            *options,
-        ]
-        child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        log.write_text("")
+        child = self.begin(["serve", "--data-dir", str(self.data_dir), *options], str(log))
         self._stack.callback(self._end, child)
-        assert child.stdout is not None
         lines = [child.stdout.readline() for _ in range(2)]
         return child, dict(line.strip().split(": ", 1) for line in lines if line), log
 
@@ -39,8 +31,7 @@ class Serving:
         self._stack.close()
 
     @staticmethod
-    def _end(child: subprocess.Popen) -> None:
+    def _end(child: warm.Child) -> None:
         child.kill()
         child.wait()
-        assert child.stdout is not None
         child.stdout.close()

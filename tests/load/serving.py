@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import os
 import re
 import secrets
 import sqlite3
@@ -17,7 +18,6 @@ from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from aiohttp import ClientSession
 
@@ -36,6 +36,18 @@ _AHEAD = 6
 _SPARE = 12
 
 
+def command(words: list[str], log: str) -> subprocess.Popen[str]:
+    """Begins ``onedemo`` with some words; what it says on stderr goes to the end of the log."""
+    # By name: what is measured stands above this package, which imports nothing of it.
+    program = [sys.executable, "-m", "onedemo.app.cli", *words]
+    with open(log, "a") as errors:
+        return subprocess.Popen(program, stdout=subprocess.PIPE, stderr=errors, text=True)
+
+
+begin = command
+"""How servers are begun here. The tests, which do not measure how long that takes, have a quicker way."""
+
+
 class Server:
     """``onedemo serve`` on a data directory, until ``close``.
 
@@ -51,7 +63,7 @@ class Server:
     def __init__(self, data_dir: Path, settings: Sequence[str] = ()) -> None:
         self.data_dir = data_dir
         self._log = data_dir.with_name(f"{data_dir.name}.err").open("w+")
-        self._child = self.spawn(data_dir, settings, self._log)
+        self._child = self.spawn(data_dir, settings, self._log.name)
         assert self._child.stdout is not None
         lines = [self._child.stdout.readline() for _ in range(2)]
         self.links = dict(line.strip().split(": ", 1) for line in lines if line)
@@ -65,25 +77,13 @@ class Server:
                 store.accounts.set_practised(rater.id)
 
     @staticmethod
-    def spawn(
-        data_dir: Path, settings: Sequence[str] = (), log: IO[str] | int = subprocess.DEVNULL
-    ) -> subprocess.Popen[str]:
+    def spawn(data_dir: Path, settings: Sequence[str] = (), log: str = os.devnull) -> subprocess.Popen[str]:
         """The process alone, just begun; it says on its standard output when it is ready."""
-        # By name: what is measured stands above this package, which imports nothing of it.
-        command = [
-            sys.executable,
-            "-m",
-            "onedemo.app.cli",
-            "serve",
-            "--data-dir",
-            str(data_dir),
-            "--port",
-            "0",
-        ]
-        command += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
-        command += [word for setting in settings for word in ("--set", setting)]
-        command += ["--new-run"] if settings else []
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+        words = ["serve", "--data-dir", str(data_dir), "--port", "0"]
+        words += ["--shared", "0", "--repeated", "0"]  # each press is a rating of another clip
+        words += [word for setting in settings for word in ("--set", setting)]
+        words += ["--new-run"] if settings else []
+        return begin(words, log)
 
     @property
     def base(self) -> str:

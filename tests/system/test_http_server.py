@@ -83,6 +83,7 @@ def test_nothing_without_a_session(site, path):
 
 
 VENDORED = "/static/vendor/uplot/uPlot.min.css"
+VISER = "/static/viser/viser.css"
 EXAMPLE = choose(None, DEMO_FRAMES, 9).guide[0].name
 EXAMPLES = {
     "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": EXAMPLE, "iteration": "1", "suffix": "jpg",
@@ -96,7 +97,7 @@ STRANGERS_MAY = {
 ANNOTATORS_MAY = {"/", "/r/2", "/r/2/", "/r/2/press", "/r/2/signout", "/r/2/rate"} | {
     place + path
     for path in (
-        "/static/page.css", VENDORED, "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
+        "/static/page.css", VENDORED, VISER, "/clips/1.jpg", "/pairs/1.jpg", "/demo/frames/3.jpg",
         f"/demo/examples/{EXAMPLE}.jpg", "/demo/video.webm",
     )
     for place in ("", "/r/2")
@@ -123,6 +124,7 @@ def test_every_route_asks_for_its_role(site, role):
     for route in site.front.routes():
         path = route.path.replace("/static/{name}", "/static/page.css")
         path = path.replace("/static/vendor/{package}/{name}", VENDORED)
+        path = path.replace("/static/viser/{name}", VISER)
         for name, example in EXAMPLES.items():
             path = re.sub(rf"\{{{name}(:[^/]*?(\{{\d+(,\d+)?\}})?)?\}}(?=[./]|$)", example, path)
         if role == "researcher":

@@ -51,6 +51,7 @@ def visit(store, what, *, role="researcher", **limits):
             Route("GET", "/demos/{upload}/poster.jpg", "researcher", taken.poster),
             Route("POST", "/demos/{upload}/result", "researcher", taken.bring_in),
             Route("GET", "/demos/{upload}/result-{result}.webm", "researcher", taken.result),
+            Route("GET", "/demos/{upload}/result-{result}-{end}.jpg", "researcher", taken.still),
             Route("POST", "/demos/{upload}/keep", "researcher", taken.keep),
             Route("POST", "/demos/{upload}/discard", "researcher", taken.discard),
         ]
@@ -178,6 +179,33 @@ def test_a_part_is_looked_at_and_chosen_anew_without_sending_the_video_again(sto
     assert list_own(here) == ["half"] and list((here / "uploads").iterdir()) == []
 
 
+def test_a_result_stays_where_the_next_cannot_be_made(store, video):
+    """It is what is seen, and what is kept, with its first and its last frame."""
+    here = store.path.parent
+
+    async def what(session, url):
+        sender = Sender(session, url)
+        at = f"/demos/{(await sender.add(video))['upload']}"
+        assert (await sender.get(f"{at}/result-0-first.jpg"))[0] == 404
+        part = {"start": 0.2, "speed": 2, "reverse": True, "loop": True}
+        facts = await sender.post(f"{at}/result", json=part)
+        done = "from 0.2 s on, 2 times as fast, backwards, repeated to fill 8 s"
+        assert (facts["seconds"], facts["edits"]) == (8.0, done)
+        for _ in range(2):
+            with pytest.raises(Refused, match="“Hold the background still” finds no background"):
+                await sender.post(f"{at}/result", json=part | {"stabilise": True})
+        ends = [await sender.get(f"{at}/result-{facts['result']}-{end}.jpg") for end in ("first", "last")]
+        decoded = [cv2.imdecode(np.frombuffer(data, np.uint8), 1) for _, data in ends]
+        assert [number_of(image) for image in decoded] == [28, 6]
+        assert (await sender.get(f"{at}/result-{facts['result']}.webm"))[0] == 200
+        assert len(list((here / "uploads").glob("*/result-*"))) == 1
+        await sender.keep(at.split("/")[-1], "back")
+
+    visit(store, what)
+    demo = find_demo("back", here / "demos")
+    assert [number_of(frame) for frame in read_frames(demo)[:12]] == list(range(28, 4, -2))
+
+
 def list_own(here):
     return [demo.name for demo in list_demos(here / "demos") if demo.path.is_relative_to(here)]
 
@@ -255,7 +283,13 @@ def test_only_from_the_page(store, video):
         (None, {"crop": [1, 2, 3]}, "The part of the picture is four whole numbers"),
         (None, {"crop": [0, 0, 9999, 9999]}, "[Cc]rop"),
         (None, {"crop": [-5, 0, 64, 64]}, "[Cc]rop"),
-        (None, {"owner": "me"}, "has start, end, crop and mirror"),
+        (None, {"owner": "me"}, "A part of a video has crop, end, loop, .* track"),
+        (None, {"speed": 0}, "^“Speed” must be a number from 0.1 to 20, .* got 0.$"),
+        (None, {"speed": "fast"}, "^“Speed” must be a number"),
+        (None, {"loop": 0}, "^“Repeat” must be a whole number, 1 or more"),
+        (None, {"loop": 99}, "^“Repeat” 99 of 1.00 s is 99 s.* “Repeat” 60 is the most here"),
+        (None, {"rotate": 45}, "^“Turn” must be 90, 180 or 270 degrees clockwise"),
+        (None, {"stabilise": True}, "^“Hold the background still” finds no background in the video at"),
         (None, {"field": "name"}, "one field, video"),
     ],
 )

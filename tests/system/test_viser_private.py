@@ -18,10 +18,10 @@ def test_version_is_the_one_that_was_read():
     assert viser.__version__ == "1.1.1"
 
 
-def test_html_has_the_places_where_ours_goes():
+def test_our_scripts_run_before_viser_s_client_which_is_packed_as_it_was():
     html = assets.page_html()
-    assert "<title>onedemo</title>" in html and "Viser</title>" not in html
-    assert html.index("static/page.js") < html.index("data-p=")
+    assert html.index("static/page.js") < html.index("static/viser/viser.js")
+    assert assets.viser_files()["zstd.wasm"].kind == "application/wasm"
 
 
 def test_nobody_can_talk_to_the_server_as_a_whole(site):

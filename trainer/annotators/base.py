@@ -4,7 +4,7 @@
 ``onedemo.annotators.noise``
 what goes wrong on the way to a rating. Nothing that learns may import this module.
 
-Shapes: W control steps, q = v = 6.
+Shapes: W control steps, q positions, v velocities.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _STREAM = 1511
 """Sets a rater's random numbers apart from others that the same seed gives."""
 
 
-_SHORTEST_MARK = 4
-"""Control steps: about a frame."""
+_SHORTEST_MARK_SECONDS = 0.032
+"""About a frame."""
 _STANDS_OUT = 0.5
 """Of the width of a class."""
 
@@ -55,6 +55,7 @@ class DistanceAnnotator(Budget):
 
     Args:
         thresholds: Four mean distances, ascending, beyond each of which a point is taken off.
+        dt: Seconds of a control step.
         budget: Ratings it will give in all, enforced here.
         given: Ratings it gave before, in an earlier process.
         seed: Of what chance there is in the errors.
@@ -68,6 +69,7 @@ class DistanceAnnotator(Budget):
         self,
         thresholds: Sequence[float],
         *,
+        dt: float,
         budget: int,
         given: int = 0,
         seed: int = 0,
@@ -76,6 +78,7 @@ class DistanceAnnotator(Budget):
         super().__init__(budget, given)
         self._thresholds = np.asarray(thresholds, float)
         self._seed, self._errors = seed, errors
+        self._shortest_mark = max(1, round(_SHORTEST_MARK_SECONDS / dt))
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance step by step, (W,), from the demo from control step ``demo_step`` on.
@@ -130,7 +133,7 @@ class DistanceAnnotator(Budget):
         start = int(above[: end + 1].argmin())
         inside = np.zeros(len(distances), bool)
         inside[start:end] = True
-        if end - start < _SHORTEST_MARK or len(distances) - (end - start) < _SHORTEST_MARK:
+        if min(end - start, len(distances) - (end - start)) < self._shortest_mark:
             return None
         width = Look(distances=distances, thresholds=self._thresholds).width
         stands_out = distances[inside].mean() - distances[~inside].mean() >= _STANDS_OUT * width

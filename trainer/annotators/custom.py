@@ -42,6 +42,7 @@ class OwnRater(Budget):
     Args:
         name: ``package.module:Class``.
         demo: What is shown beside the robot.
+        robot: Name of the robot.
         budget: Ratings it will give in all, enforced here.
         given: Ratings it gave before, in an earlier process.
 
@@ -49,11 +50,11 @@ class OwnRater(Budget):
         UserError: If there is no such class, or it cannot be made or asked.
     """
 
-    def __init__(self, name: str, *, demo: Demo, budget: int, given: int = 0) -> None:
+    def __init__(self, name: str, *, demo: Demo, robot: str = "hopper", budget: int, given: int = 0) -> None:
         super().__init__(budget, given)
         self.name = name
         self._rate = _find(name)
-        self._demo, self._dt = demo, robot_named("hopper").dt
+        self._demo, self._dt = demo, robot_named(robot).dt
         self._frames: np.ndarray | None = None
         self._renderer: Any = None
 

@@ -6,7 +6,8 @@ models, ``oracle+mistake:0.1+jitter`` (``onedemo.annotators.noise``), and by ``+
 Nothing that learns may import this module or ``onedemo.demos.ground_truth``: a rater sees the demo's
 states, the learner sees nothing but the rating.
 
-Shapes: W control steps, q = v = 6.
+Shapes: W control steps, q positions, v velocities, A axes and K numbers that are compared
+(``onedemo.sim.kinematics``).
 """
 
 from __future__ import annotations
@@ -24,12 +25,16 @@ from onedemo.annotators.noise import Errors, parse_errors
 from onedemo.annotators.scripted import Script, load_marks, table_path
 from onedemo.demos.ground_truth import HiddenStates
 from onedemo.errors import UserError
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import Body, body_of
 from onedemo.types import Demo, Segment
 
 __all__ = ["THRESHOLDS", "Oracle", "RatingBudgetSpent", "SimulatedRater", "appearance", "make_rater"]
 
 THRESHOLDS = (0.9, 1.3, 1.7, 2.15)
-"""Mean distances (see ``appearance``) beyond which the oracle takes one point off."""
+"""Mean distances (see ``appearance``) beyond which the oracle takes one point off a hopper."""
+_MEANT_FOR = 2.23
+"""Sum of the squared weights of a hopper's four limbs: 1, 0.49, 0.49 and 0.25."""
 
 MARKS = "marks"
 """In a rater's name: it marks, too."""
@@ -57,8 +62,9 @@ class Oracle(DistanceAnnotator):
 
     Args:
         hidden: The demo's states.
+        robot: Name of the robot.
         budget: Ratings it will give, enforced here.
-        thresholds: Four distances, ascending.
+        thresholds: Four distances, ascending; those of ``thresholds_of`` if None.
         given: Ratings it gave before, in an earlier process.
         seed: Of what chance there is in the errors.
         errors: What it gets wrong.
@@ -67,22 +73,29 @@ class Oracle(DistanceAnnotator):
     def __init__(
         self,
         hidden: HiddenStates,
+        robot: str = "hopper",
         *,
         budget: int,
-        thresholds: Sequence[float] = THRESHOLDS,
+        thresholds: Sequence[float] | None = None,
         given: int = 0,
         seed: int = 0,
         errors: Errors = (),
     ) -> None:
-        super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
+        self.body = body_of(robot_named(robot))
+        """Of the robot."""
+        given_ones = thresholds_of(self.body) if thresholds is None else thresholds
+        super().__init__(
+            given_ones, dt=self.body.robot.dt, budget=budget, given=given, seed=seed, errors=errors
+        )
         self.hidden = hidden
         """The demo's states."""
-        self._demo = appearance(hidden.qpos, hidden.qvel)
+        self._demo = appearance(hidden.qpos, hidden.qvel, self.body)
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance in appearance, step by step, (W,), from the demo's states at the same steps on."""
         demo = self._demo[demo_step : demo_step + len(qpos)]
-        return np.linalg.norm(appearance(qpos[: len(demo)], qvel[: len(demo)]) - demo, axis=-1)
+        seen = appearance(qpos[: len(demo)], qvel[: len(demo)], self.body)
+        return np.linalg.norm(seen - demo, axis=-1)
 
     def true_similarity(self, qpos: np.ndarray, qvel: np.ndarray) -> float:
         """Mean rating of single states of an episode against the demo at the same step; evaluation.
@@ -97,35 +110,49 @@ class Oracle(DistanceAnnotator):
         return float(self.rating_of(self.distance(qpos, qvel, 0)).mean())
 
 
-def appearance(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """What a person sees of a Hopper in a clip whose camera follows it: x is not visible.
+def appearance(qpos: np.ndarray, qvel: np.ndarray, body: Body) -> np.ndarray:
+    """What a person sees of a robot in a clip whose camera follows it: the place itself is not visible.
 
-    Absolute directions of the four body segments are closer to what the eye compares than joint
-    angles; the slower, heavier torso counts more than the foot.
+    Absolute directions of limbs are closer to what the eye compares than joint angles; the slower, heavier
+    root counts more than what hangs at it, and tips count least (``Body.weights``).
 
     Args:
-        qpos: Positions, (..., 6).
-        qvel: Velocities, (..., 6).
+        qpos: Positions, (..., q).
+        qvel: Velocities, (..., v).
+        body: Of the robot.
 
     Returns:
-        (..., 12): height, sine and cosine of the four segments' directions, torso spin, vertical and
-        horizontal velocity, each in units in which 1 is a clearly visible difference.
+        (..., K): height beside that at rest, how far each limb points right and up, spin of the root,
+        vertical and horizontal velocity, each in units in which 1 is a clearly visible difference. A hopper
+        has 12 of them.
     """
-    torso = qpos[..., 2]
-    thigh = torso - qpos[..., 3]
-    leg = thigh - qpos[..., 4]
-    foot = leg - qpos[..., 5]
-    parts = [1.5 * (qpos[..., 1] - 1.25)]
-    for angle, weight in ((torso, 1.0), (thigh, 0.7), (leg, 0.7), (foot, 0.5)):
-        parts += [weight * np.sin(angle), weight * np.cos(angle)]
-    spin = 0.15 * np.clip(qvel[..., 2], -10, 10)
-    parts += [spin, 0.15 * qvel[..., 1], 0.08 * qvel[..., 0]]
-    return np.stack(parts, axis=-1)
+    directions = body.weights[:, None] * body.axes(qpos)
+    rates = body.root_rates(qpos, qvel)
+    parts = [
+        (1.5 * (body.height(qpos) - body.rest_height))[..., None],
+        directions.reshape(*directions.shape[:-2], -1),
+        0.15 * np.clip(rates.spin, -10, 10),
+        0.15 * rates.climb[..., None],
+        0.08 * rates.travel[..., None],
+    ]
+    return np.concatenate(parts, axis=-1)
+
+
+def thresholds_of(body: Body) -> np.ndarray:
+    """Distances beyond which the oracle takes one point off, (4,).
+
+    The more limbs are compared, the farther apart are two poses that have nothing in common: in proportion to
+    the root of the sum of squared weights, of which directions in space show two thirds in a picture. The
+    hopper's thresholds are scaled by that.
+    """
+    shown = 1.0 if body.planar else 2 / 3
+    return np.array(THRESHOLDS) * np.sqrt(shown * np.square(body.weights).sum() / _MEANT_FOR)
 
 
 def make_rater(
-    name: str, hidden: HiddenStates | None, *, demo: Demo, budget: int, given: int = 0, seed: int = 0
-) -> SimulatedRater:
+    name: str, hidden: HiddenStates | None, *, demo: Demo, budget: int, given: int = 0, seed: int = 0,
+    robot: str = "hopper",
+) -> SimulatedRater:  # fmt: skip
     """The simulated rater of that name.
 
     Args:
@@ -136,6 +163,7 @@ def make_rater(
         budget: Ratings the rater will give in a run, enforced by itself.
         given: Of these, before now.
         seed: Of the rater's errors, unless the name gives one.
+        robot: Name of the robot that is rated.
 
     Raises:
         UserError: If there is no such rater, or it does not fit the demo.
@@ -151,12 +179,14 @@ def make_rater(
                 "use a built-in demo or a table of marks (--rater script), or rate it yourself with "
                 "`onedemo serve`"
             )
-        annotator: DistanceAnnotator = Oracle(hidden, budget=budget, given=given, seed=seed, errors=errors)
+        annotator: DistanceAnnotator = Oracle(
+            hidden, robot, budget=budget, given=given, seed=seed, errors=errors
+        )
         annotator.marking = MARKS in parts
         return annotator
     if kind == "script":
         marks = load_marks(Path(rest) if rest else table_path(demo.path), demo)
-        annotator = Script(marks, budget=budget, given=given, seed=seed, errors=errors)
+        annotator = Script(marks, robot, budget=budget, given=given, seed=seed, errors=errors)
         annotator.marking = MARKS in parts
         return annotator
     if kind == "oracle" or not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", base):
@@ -166,7 +196,7 @@ def make_rater(
             f"rater {name!r}: error models need a rater that measures a distance, oracle or script; "
             f"let {base} make its own errors"
         )
-    return OwnRater(base, demo=demo, budget=budget, given=given)
+    return OwnRater(base, demo=demo, robot=robot, budget=budget, given=given)
 
 
 def marker(rater: SimulatedRater) -> Callable[[Segment, int], tuple[int, int] | None] | None:

@@ -9,7 +9,7 @@ ascending. Pitch is the direction from hip to neck, degrees from upright, backwa
 wrapped: a backflip goes from 0 to 360. Airborne is true (or 1) or false (or 0). In between, marks are
 interpolated linearly; before the first and after the last they stay.
 
-Shapes: M marks, W control steps, q = v = 6.
+Shapes: M marks, W control steps, q positions, v velocities.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ import numpy as np
 from onedemo.annotators.base import DistanceAnnotator
 from onedemo.annotators.noise import Errors
 from onedemo.errors import UserError
-from onedemo.robots.hopper import CONTACT_MARGIN, clearances
 from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import CONTACT_MARGIN
+from onedemo.sim.kinematics import Body, body_of
 from onedemo.types import Demo
 
 SUFFIX = ".script.json"
@@ -44,6 +45,7 @@ class Script(DistanceAnnotator):
 
     Args:
         marks: The table, (M, 3): seconds, pitch in degrees, airborne 0..1.
+        robot: Name of the robot.
         budget: Ratings it will give, enforced here.
         thresholds: Four distances, ascending.
         given: Ratings it gave before, in an earlier process.
@@ -54,6 +56,7 @@ class Script(DistanceAnnotator):
     def __init__(
         self,
         marks: np.ndarray,
+        robot: str = "hopper",
         *,
         budget: int,
         thresholds: Sequence[float] = THRESHOLDS,
@@ -61,29 +64,34 @@ class Script(DistanceAnnotator):
         seed: int = 0,
         errors: Errors = (),
     ) -> None:
-        super().__init__(thresholds, budget=budget, given=given, seed=seed, errors=errors)
+        self._body = body_of(robot_named(robot))
+        self._dt = self._body.robot.dt
+        super().__init__(thresholds, dt=self._dt, budget=budget, given=given, seed=seed, errors=errors)
         self._marks = marks
-        self._dt = robot_named("hopper").dt
 
     def distance(self, qpos: np.ndarray, qvel: np.ndarray, demo_step: int) -> np.ndarray:
         """Distance step by step, (W,), from the marks from control step ``demo_step`` on."""
         seconds = self._dt * (demo_step + np.arange(len(qpos)))
-        return np.linalg.norm(visible(qpos, qvel) - marked(self._marks, seconds), axis=-1)
+        return np.linalg.norm(visible(qpos, qvel, self._body) - marked(self._marks, seconds), axis=-1)
 
 
-def visible(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+def visible(qpos: np.ndarray, qvel: np.ndarray, body: Body) -> np.ndarray:
     """What the marks tell of, on the robot, in units in which 1 is a clearly visible difference.
 
     Args:
-        qpos: Positions, (..., 6).
-        qvel: Velocities, (..., 6).
+        qpos: Positions, (..., q).
+        qvel: Velocities, (..., v).
+        body: Of the robot.
 
     Returns:
-        (..., 4): sine and cosine of the torso's pitch (a whole turn looks the same), its spin and
-        whether nothing touches the ground.
+        (..., 4): sine and cosine of the root's pitch (a whole turn looks the same), its spin and
+        whether nothing touches the ground. A fixed root has no spin.
     """
-    gap = np.minimum.reduce(list(clearances(qpos).values()))
-    return _features(-qpos[..., 2], -qvel[..., 2], gap >= CONTACT_MARGIN)  # leaning back is negative there
+    gap = np.minimum.reduce(list(body.clearances(qpos).values()))
+    right, up = np.moveaxis(body.axes(qpos)[..., body.upright, :], -1, 0)
+    spin = body.root_rates(qpos, qvel).spin
+    back = -spin[..., 0] if spin.shape[-1] else np.zeros_like(right)
+    return _features(np.arctan2(-right, up), back, gap >= CONTACT_MARGIN)  # forward, as seen, is clockwise
 
 
 def marked(marks: np.ndarray, seconds: np.ndarray) -> np.ndarray:

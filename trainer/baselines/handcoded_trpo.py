@@ -2,7 +2,8 @@
 
 ``python -m onedemo.baselines handcoded_trpo --task backflip --steps 3000000 --seed 2 --out PREFIX``
 writes ``PREFIX.hidden.npz`` (the best episode of the best policy), ``PREFIX.policy.pt`` and
-``PREFIX.json`` (settings and the learning curve).
+``PREFIX.json`` (settings and the learning curve). ``--robot walker2d --task forward`` trains another
+robot on gymnasium's own reward.
 """
 
 from __future__ import annotations
@@ -16,7 +17,16 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from onedemo.baselines.scores import SAVED, Score, measure, save_training
+from onedemo.baselines.scores import (
+    FORWARD,
+    SAVED,
+    TASKS,
+    UNTIL_FALL,
+    Score,
+    check_task,
+    measure,
+    save_training,
+)
 from onedemo.core.cpu import cores
 from onedemo.core.outputs import check_prefix
 from onedemo.demos.ground_truth import HiddenStates
@@ -32,8 +42,10 @@ from onedemo.sim.task_rewards import TASK_REWARDS
 class HandcodedConfig:
     """One training on a hand-coded reward."""
 
+    robot: str = "hopper"
+    """Its name."""
     task: str = "backflip"
-    """A key of ``motion.TASK_REWARDS``."""
+    """One of ``TASKS``."""
     steps: int = 3_000_000
     """Control steps to collect, all lanes together."""
     seed: int = 0
@@ -43,7 +55,7 @@ class HandcodedConfig:
     batch: int = 500
     """Control steps of each lane in an iteration."""
     horizon: int = 1000
-    """Control steps in an episode: 8 s."""
+    """Control steps in an episode: 8 s of a hopper."""
     evaluate_every: int = 10
     """Iterations between evaluations (16 deterministic episodes)."""
     threads: int = field(default_factory=cores)
@@ -58,9 +70,7 @@ class HandcodedConfig:
     """The step."""
 
     def __post_init__(self) -> None:
-        if self.task not in TASK_REWARDS:
-            choices = ", ".join(sorted(TASK_REWARDS))
-            raise UserError(f"unknown task {self.task!r}; choose one of: {choices}")
+        check_task(self.robot, self.task)
         for name in ("steps", "lanes", "batch", "horizon", "evaluate_every", "threads"):
             if getattr(self, name) < 1:
                 raise UserError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -96,14 +106,14 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
     """
     check_device(config.device)
     torch.set_num_threads(1)  # these networks are too small to gain from more
-    # Hopping is learned as in Hopper-v5, where a fall ends the episode; a flip is no fall.
+    # Going ahead is learned as in gymnasium, where a fall ends the episode; a flip is no fall.
     env = vector_env.make(
-        "hopper",
+        config.robot,
         config.lanes,
         horizon=config.horizon,
         nthread=config.threads,
         physics=config.physics,
-        terminate_when_unhealthy=config.task == "hop",
+        terminate_when_unhealthy=config.task in UNTIL_FALL,
     )
     policy = Policy(
         config.policy,
@@ -111,10 +121,10 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         action_size=env.robot.action_size,
         horizon=config.horizon,
         seed=config.seed,
+        angles=env.robot.angles,
     ).to(config.device)
     trpo = Trpo(policy, config.trpo, seed=config.seed, threads=config.threads)
     collector = Collector(env, seed=config.seed)
-    reward = TASK_REWARDS[config.task]
     per_iteration = config.lanes * config.batch
     iterations = -(-config.steps // per_iteration)
     started = time.monotonic()
@@ -124,13 +134,18 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
         for iteration in range(1, iterations + 1):
             acting = policy.snapshot(on_device=config.device != "cpu")
             batch = collector.collect(acting, config.batch)
-            rewards = reward(batch.next_obs, batch.actions, batch.qpos, batch.next_qpos, batch.next_qvel)
-            stats = trpo.update(replace(batch, rewards=rewards))
+            if config.task != FORWARD:  # which is what the environment gives
+                of = TASK_REWARDS[config.task]
+                rewards = of(batch.next_obs, batch.actions, batch.qpos, batch.next_qpos, batch.next_qvel)
+                batch = replace(batch, rewards=rewards)
+            stats = trpo.update(batch)
             bar.update(per_iteration)
             if iteration % config.evaluate_every == 0 or iteration == iterations:
-                episodes = evaluate(policy.snapshot(), "hopper", seed=config.seed + 1, horizon=config.horizon)
+                episodes = evaluate(
+                    policy.snapshot(), config.robot, seed=config.seed + 1, horizon=config.horizon
+                )
                 steps, seconds = iteration * per_iteration, time.monotonic() - started
-                score, episode = measure(config.task, episodes, steps=steps, seconds=seconds)
+                score, episode = measure(config.task, episodes, steps=steps, seconds=seconds, of=env.robot)
                 curve.append(score)
                 if best is None or score.reward_mean > best[0].reward_mean:
                     best = score, policy.to_dict(), episode
@@ -138,6 +153,7 @@ def train_handcoded(config: HandcodedConfig, *, progress: bool = True) -> Handco
                     reward=round(score.reward_mean),
                     best=round(score.reward_max),
                     turns=round(score.net_turns_mean, 1),
+                    travel=round(score.travel, 1),
                     upright=round(score.upright_seconds, 1),
                     kl=round(stats.kl, 3),
                     explained=round(stats.explained_variance, 2),
@@ -172,9 +188,11 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m onedemo.baselines handcoded_trpo", description="TRPO on a hand-coded reward."
     )
-    parser.add_argument("--task", choices=sorted(TASK_REWARDS), default="backflip")
+    parser.add_argument("--task", choices=sorted(TASKS), default="backflip")
+    parser.add_argument("--robot", default="hopper")
     parser.add_argument("--steps", type=int, default=3_000_000, help="control steps")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--horizon", type=int, default=1000, help="control steps in an episode")
     parser.add_argument("--out", type=Path, required=True, help="prefix of the files to write")
     parser.add_argument("--max-kl", type=float, default=TrpoConfig().max_kl, help="nats")
     parser.add_argument("--gamma", type=float, default=TrpoConfig().gamma)
@@ -182,7 +200,9 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     check_prefix(args.out, SAVED)
     config = HandcodedConfig(
+        robot=args.robot,
         task=args.task,
+        horizon=args.horizon,
         steps=args.steps,
         seed=args.seed,
         evaluate_every=args.evaluate_every,

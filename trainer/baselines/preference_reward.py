@@ -19,10 +19,12 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from onedemo.reward.two_branch_net import STANDARD_DIMS, standard_inputs
+from onedemo.core import optimisers
+from onedemo.reward.two_branch_net import standard_inputs, standard_size
 from onedemo.types import Segment
 
 Pair = tuple[Segment, Segment]
+_STANDARD_DIMS = standard_size("hopper")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -111,7 +113,7 @@ class RewardEnsemble:
             (...), float32.
         """
         inputs = standard_inputs(obs, actions)
-        flat = torch.from_numpy(inputs.reshape(-1, STANDARD_DIMS))
+        flat = torch.from_numpy(inputs.reshape(-1, _STANDARD_DIMS))
         with torch.inference_mode():
             out_Kn = (self._nets(flat.expand(len(self._mean), -1, -1)) - self._mean[:, None]) / self._std[
                 :, None
@@ -174,7 +176,7 @@ def fit_reward(
     target_n = torch.tensor([c.preference for c in comparisons], dtype=torch.float32)
     n, steps, K = len(comparisons), x_n2WS.shape[2], config.members
     nets = _Nets(K, config.hidden, generator)
-    optimiser = torch.optim.AdamW(nets.parameters(), config.rate, weight_decay=config.decay, foreach=True)
+    optimiser = optimisers.AdamW(nets.parameters(), config.rate, weight_decay=config.decay, foreach=True)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.updates)
     bags_Kn = torch.randint(n, (K, n), generator=generator)
     stride = min(config.stride, steps)
@@ -188,7 +190,7 @@ def fit_reward(
         optimiser.step()
         fall.step()
     with torch.no_grad():
-        out_KN = nets(x_n2WS.reshape(-1, STANDARD_DIMS).expand(K, -1, -1))
+        out_KN = nets(x_n2WS.reshape(-1, _STANDARD_DIMS).expand(K, -1, -1))
         mean_K, std_K = out_KN.mean(1), out_KN.std(1).clamp_min(1e-6)
         scale = ((out_KN - mean_K[:, None]) / std_K[:, None]).mean(0).std().clamp_min(1e-6)
         margins_Kn = _difference(out_KN.reshape(K, n, 2, steps))
@@ -209,7 +211,7 @@ class _Nets(nn.Module):
 
     def __init__(self, members: int, hidden: tuple[int, int], generator: torch.Generator) -> None:
         super().__init__()
-        sizes = (STANDARD_DIMS, *hidden, 1)
+        sizes = (_STANDARD_DIMS, *hidden, 1)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in itertools.pairwise(sizes):
             weight = torch.empty(members, fan_in, fan_out)
@@ -239,7 +241,7 @@ def _margins(nets: _Nets, inputs: torch.Tensor) -> torch.Tensor:
     if inputs.dim() == 4:
         inputs = inputs.expand(K, *inputs.shape)
     shape = inputs.shape[1:4]
-    return _difference(nets(inputs.reshape(K, -1, STANDARD_DIMS)).reshape(K, *shape))
+    return _difference(nets(inputs.reshape(K, -1, _STANDARD_DIMS)).reshape(K, *shape))
 
 
 def _difference(out: torch.Tensor) -> torch.Tensor:

@@ -14,11 +14,13 @@ from typing import Any
 import torch
 
 from onedemo.demos.ground_truth import SUFFIX, HiddenStates, save_hidden
+from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy
 from onedemo.rl.rollouts import Episodes
 from onedemo.robots.registry import robot_named
-from onedemo.sim.task_rewards import task_reward, until_fall
+from onedemo.robots.robot import Robot
+from onedemo.sim.task_rewards import TASK_REWARDS, task_reward, until_fall
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -38,22 +40,47 @@ class Score:
     clean_turns_mean: float
     """Backward turns of an episode on the foot alone."""
     upright_seconds: float
-    """Mean time until the stock Hopper-v5 would have fallen."""
+    """Mean time until it would have fallen by gymnasium's rule."""
+    travel: float = 0.0
+    """Mean distance gone, metres."""
 
 
-def measure(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tuple[Score, HiddenStates]:
+FORWARD = "forward"
+"""Gymnasium's own reward of a robot: ahead, upright, with small actions."""
+TASKS = (*TASK_REWARDS, FORWARD)
+"""Hand-coded rewards."""
+UNTIL_FALL = ("hop", FORWARD)
+"""Those that end with a fall, by gymnasium's rule."""
+
+
+def check_task(robot: str, task: str) -> None:
+    """Whether a robot has a hand-coded reward.
+
+    Raises:
+        UserError: If there is no such robot or task, or the task is the hopper's.
+    """
+    own = TASKS if robot_named(robot).name == "hopper" else (FORWARD,)
+    if task not in own:
+        raise UserError(f"unknown task {task!r} of robot {robot!r}; choose one of: {', '.join(sorted(own))}")
+
+
+def measure(
+    task: str, episodes: Episodes, *, steps: int, seconds: float, of: Robot | None = None
+) -> tuple[Score, HiddenStates]:
     """The score of an evaluation, and its episode of the highest reward.
 
     Args:
-        task: A key of ``motion.TASK_REWARDS``.
+        task: One of ``TASKS``.
         episodes: The evaluation.
         steps: Control steps used for training so far.
         seconds: Wall time so far.
+        of: The robot; the hopper if not given.
     """
     states = episodes.obs, episodes.actions, episodes.qpos, episodes.qvel
-    rewards_NT = task_reward(task, *states)
-    upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:])
-    if task == "hop":  # the stock episode ends at the fall
+    of = of or robot_named("hopper")
+    rewards_NT = episodes.rewards if task == FORWARD else task_reward(task, *states)
+    upright_NT = until_fall(episodes.qpos[:, 1:], episodes.qvel[:, 1:], of)
+    if task in UNTIL_FALL:  # the stock episode ends at the fall
         rewards_NT = rewards_NT * upright_NT
     totals_N = rewards_NT.sum(1)
     score = Score(
@@ -61,9 +88,10 @@ def measure(task: str, episodes: Episodes, *, steps: int, seconds: float) -> tup
         seconds=round(seconds, 1),
         reward_mean=float(totals_N.mean()),
         reward_max=float(totals_N.max()),
-        net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()),
-        clean_turns_mean=float(clean_turns(episodes.qpos).mean()),
-        upright_seconds=float(upright_NT.sum(1).mean() * robot_named("hopper").dt),
+        net_turns_mean=float(net_turns(episodes.qpos[..., 2]).mean()) if of.root == "planar" else 0.0,
+        clean_turns_mean=float(clean_turns(episodes.qpos).mean()) if of.name == "hopper" else 0.0,
+        upright_seconds=float(upright_NT.sum(1).mean() * of.dt),
+        travel=float((episodes.qpos[:, -1, 0] - episodes.qpos[:, 0, 0]).mean()),
     )
     lane = int(totals_N.argmax())
     episode = HiddenStates(

@@ -18,20 +18,26 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import islice
 from typing import BinaryIO
 
 import av.logging
 import cv2
 import numpy as np
 
+from onedemo.demos.camera import Survey, View
+from onedemo.demos.edits import Options
+from onedemo.demos.frame_geometry import TURNS, turned
 from onedemo.demos.import_checks import STORED_SIDE, SourceWatch, check_length, check_size
-from onedemo.demos.resampling import resample
-from onedemo.demos.sandboxed_decoder import LENGTH, LOOK, MAX_SENTENCE, SIZE, Options
+from onedemo.demos.resampling import arranged, resample
+from onedemo.demos.sandboxed_decoder import LENGTH, LOOK, MAX_SENTENCE, SIZE
 from onedemo.demos.source import Shown, Source
 from onedemo.errors import UserError
 
 _TINY = b"YUV4MPEG2 W16 H16 F10:1 It C420jpeg\n" + (b"FRAME\n" + bytes(16 * 16 * 3 // 2)) * 4
 """An interlaced video."""
+_ROOM = 192 << 20
+"""Bytes of frames that wait until their turn comes, where the last are the first or all come again."""
 
 
 def shaped_frames(
@@ -40,31 +46,92 @@ def shaped_frames(
     """The same frames, decoded in this process: for files that are trusted, and for the child.
 
     Args:
-        file: Open for reading.
+        file: Open for reading, and able to seek: what cannot be done in one go is gone through again.
         name: What sentences call it.
-        options: The part that is wanted.
+        options: The part that is wanted, and how.
         warn: Called at the end with each sentence about what is not as it should be, though usable.
 
     Raises:
         UserError: If the video is unusable; frames may have come before.
     """
-    start, end = options.start or 0.0, options.end
-    with Source(file, name) as source:
-        check_size(name, source.width, source.height, options.crop)
-        check_length(name, source.seconds, start=start, end=end)
-        watch = SourceWatch(name, source, start=start, end=end)
-        count, before, shaped = 0, None, np.empty(0)
-        for picture in resample(
-            watch.frames(), fps=options.fps, lasts=watch.last_stays, start=start,
-            end=math.inf if end is None else end,
-        ):  # fmt: skip
-            if picture is not before:  # one that stays is decoded once
-                before, shaped = picture, _shape(picture(), crop=options.crop, mirror=options.mirror)
-            yield shaped
-            count += 1
-        watch.check_whole(count, options.fps)
-        for sentence in watch.warnings(*shaped.shape[1::-1]):
-            warn(sentence)
+    film = _Film(file, name, options)
+    film.survey()
+    if not options.reverse and options.loop == 1:
+        count = 0
+        for count, frame in enumerate(film.frames(), 1):  # noqa: B007
+            yield frame
+        film.check(count)
+    else:
+        yield from arranged(film.frames, film.check, reverse=options.reverse, room=_ROOM)
+    for sentence in film.warnings:
+        warn(sentence)
+
+
+class _Film:
+    """A video on its way in, gone through as often as what is done to it asks for."""
+
+    def __init__(self, file: BinaryIO, name: str, options: Options) -> None:
+        self._file, self._name, self._options = file, name, options
+        self._view = View(box=options.crop)
+        self._watch: SourceWatch | None = None
+        self._size = (0, 0)
+        self.warnings: list[str] = []
+        """Sentences about what is not as it should be, though usable."""
+
+    def survey(self) -> None:
+        """Finds what is to be held still, or followed."""
+        options, survey, before = self._options, None, None
+        if not (options.track or options.stabilise):
+            return
+        for shown in self._shown():
+            if shown is before:
+                continue
+            before = shown
+            picture = shown[1]()
+            survey = survey or Survey(
+                self._name, (picture.shape[1], picture.shape[0]), crop=options.crop, track=options.track,
+                stabilise=options.stabilise, speed=options.speed,
+            )  # fmt: skip
+            survey.see(shown[0], picture)
+        if survey is not None:
+            self._view = survey.view(self.warnings.append)
+
+    def frames(self, first: int = 0, last: int | None = None) -> Iterator[np.ndarray]:
+        """The frames from one number up to another, in the order of the video."""
+        before, frame = None, np.empty((0, 0, 3), np.uint8)
+        for shown in islice(self._shown(), first, last):
+            if shown is not before:  # one that stays is decoded once
+                before = shown
+                seconds, picture = shown
+                frame = _shape(self._view.cut(seconds, picture()), mirror=self._options.mirror)
+                self._size = frame.shape[1], frame.shape[0]
+            yield frame
+
+    def check(self, count: int) -> int:
+        """Told how many frames there are, says how often they are wanted; raises UserError if it is amiss."""
+        assert self._watch is not None
+        times = self._options.times(count) if count else 1
+        self._watch.check_whole(count, self._options.fps, times)
+        self.warnings += self._watch.warnings(*self._size)
+        return times
+
+    def _shown(self) -> Iterator[tuple[float, Callable[[], np.ndarray]]]:
+        """When the picture of each frame comes in the video, seconds, and what gives it, turned."""
+        options, turn = self._options, TURNS[self._options.rotate]
+        start, end = options.start or 0.0, options.end
+        with Source(self._file, self._name) as source:
+            size = (source.width, source.height) if turn[0] else (source.height, source.width)
+            check_size(self._name, *size, options.crop)
+            check_length(self._name, source.seconds, start=start, end=end, speed=options.speed)
+            self._watch = SourceWatch(self._name, source, start=start, end=end, speed=options.speed)
+            pictures = (
+                (seconds, (seconds, lambda picture=picture: turned(picture(), turn)))
+                for seconds, picture in self._watch.frames()
+            )
+            yield from resample(
+                pictures, fps=options.fps, lasts=self._watch.last_stays, start=start,
+                end=math.inf if end is None else end, speed=options.speed,
+            )  # fmt: skip
 
 
 def _look(file: BinaryIO, name: str, at: float) -> tuple[Source, np.ndarray]:
@@ -78,14 +145,11 @@ def _look(file: BinaryIO, name: str, at: float) -> tuple[Source, np.ndarray]:
             shown = following
         if shown is None:
             raise UserError(f"{name} has no frame that can be decoded")
-        return source, _shape(shown.picture(), crop=None, mirror=False)
+        return source, _shape(shown.picture(), mirror=False)
 
 
-def _shape(frame: np.ndarray, *, crop: tuple[int, int, int, int] | None, mirror: bool) -> np.ndarray:
-    """Crops, mirrors and scales one frame; sides come out even, as the codec wants them."""
-    if crop is not None:
-        x, y, w, h = crop
-        frame = frame[y : y + h, x : x + w]
+def _shape(frame: np.ndarray, *, mirror: bool) -> np.ndarray:
+    """Mirrors and scales one frame; sides come out even, as the codec wants them."""
     if mirror:
         frame = frame[:, ::-1]
     height, width = frame.shape[:2]
@@ -104,6 +168,19 @@ def _resident() -> Callable[[], int]:
     # Linux counts what its parent had taken as the most that a process ever took.
     pages, page = os.open("/proc/self/statm", os.O_RDONLY), resource.getpagesize()
     return lambda: int(os.pread(pages, 99, 0).split()[1]) * page
+
+
+def _rehearse(options: Options) -> None:
+    """Surveys pictures of its own, with all that this loads: MuJoCo, too, if something is to be followed."""
+    rows, columns = np.mgrid[:96, :128] // 8
+    patches = np.repeat((rows * 101 + columns * 37)[..., None] % 200, 3, axis=2).astype(np.uint8)
+    survey = Survey("", (128, 96), crop=None, track=options.track, stabilise=options.stabilise, speed=1.0)
+    with suppress(UserError):
+        for number in range(12):
+            picture = np.roll(patches, number % 2, axis=1)
+            picture[30:66, 8 * number + 8 : 8 * number + 24] = 255
+            survey.see(number / 30, picture)
+        survey.view(str).cut(0.1, patches)
 
 
 def _limit(memory: int, cpu_seconds: int) -> None:
@@ -139,10 +216,12 @@ def _main(told: str) -> None:
     file, out = os.fdopen(0, "rb"), os.fdopen(os.dup(1), "wb", buffering=1 << 16)
     cv2.setNumThreads(1)
     av.logging.set_level(None)
+    wanted = Options(**options, crop=tuple(crop) if crop else None)
     sum(1 for _ in shaped_frames(io.BytesIO(_TINY), "", Options()))  # what is loaded late is loaded now
+    if (wanted.track or wanted.stabilise) and not look:
+        _rehearse(wanted)
     _limit(memory, cpu_seconds)
     try:
-        wanted = Options(**options, crop=tuple(crop) if crop else None)
         warnings: list[str] = []
         frames = shaped_frames(file, path, wanted, warnings.append)
         if look:

@@ -1,8 +1,8 @@
 """What may be wrong with a video that is to become a demo, each in one sentence.
 
-Each check comes as early as it can: options before the file is opened, size and length by the
-container's word before hours of video are decoded, the rest while the pictures go by, and at last whether
-what was stored shows what it should.
+Each check comes as early as it can: size and length by the container's word before hours of video are
+decoded, the rest while the pictures go by, and at last whether what was stored shows what it should. Options
+that are wrong for any video are told by ``edits``.
 
 Shapes: H rows, W columns; pictures are uint8 RGB.
 """
@@ -49,8 +49,10 @@ _OTHER = 20
 class SourceWatch:
     """Watches the source's pictures go by, to say afterwards what was wrong with them."""
 
-    def __init__(self, name: str, source: Source, *, start: float, end: float | None) -> None:
-        self._name, self._source, self._start, self._end = name, source, start, end
+    def __init__(
+        self, name: str, source: Source, *, start: float, end: float | None, speed: float = 1.0
+    ) -> None:
+        self._name, self._source, self._start, self._end, self._speed = name, source, start, end, speed
         self._seen = self._used = 0
         self._first = self._last = self._seconds = 0.0
 
@@ -74,12 +76,13 @@ class SourceWatch:
         self._check_length(self._seconds)
         return self._seconds - self._last
 
-    def check_whole(self, count: int, fps: float) -> None:
-        """Raises UserError if the source broke off or too little of it is left.
+    def check_whole(self, count: int, fps: float, times: int = 1) -> None:
+        """Raises UserError if the source broke off, or too little of it is left, or too much is made of it.
 
         Args:
             count: Pictures that were taken.
             fps: Of them, a second.
+            times: How often they are shown.
         """
         source = self._source
         reached_end = self._end is None or self._seconds < self._end
@@ -101,12 +104,18 @@ class SourceWatch:
         if self._used < 2 or count < 2:
             raise UserError(
                 f"a demo needs at least 2 frames, and {self._name} gives {min(self._used, count)} "
-                "between --start and --end"
+                f"between --start and --end{_at(self._speed)}"
             )
-        if count / fps < MIN_SECONDS - 0.5 / fps:
+        seconds = count * times / fps
+        if seconds < MIN_SECONDS - 0.5 / fps:
             raise UserError(
                 f"a demo lasts at least {MIN_SECONDS:g} s, as long as a clip, and {self._name} gives "
-                f"{count / fps:.2f} s between --start and --end"
+                f"{seconds:.2f} s between --start and --end{_at(self._speed)}"
+            )
+        if times > 1 and seconds > MAX_SECONDS + 0.5 / fps:
+            raise UserError(
+                f"--loop {times} of {count / fps:.2f} s is {seconds:.0f} s, and a demo lasts at most "
+                f"{MAX_SECONDS:g} s: --loop {max(1, math.floor(MAX_SECONDS * fps / count))} is the most here"
             )
 
     def warnings(self, width: int, height: int) -> list[str]:
@@ -122,9 +131,12 @@ class SourceWatch:
                          "before each is shown in its place")  # fmt: skip
         if source.missing:
             found.append("the file is cut off before its end; what can be read is used")
-        rate = self._used / max(1e-9, min(self._seconds, self._end or math.inf) - self._start)
+        rate = self._speed * self._used / max(1e-9, min(self._seconds, self._end or math.inf) - self._start)
         if rate < _FEW_A_SECOND:
-            found.append(f"it has {rate:.0f} frames a second; fast moves can be seen better with 24 or more")
+            found.append(
+                f"it has {rate:.0f} frames a second{_at(self._speed)}; fast moves can be seen better with "
+                "24 or more"
+            )
         if min(width, height) < _SMALL_SIDE:
             found.append(f"the picture is only {width} x {height} pixels; details will be hard to see")
         return found
@@ -138,8 +150,8 @@ class SourceWatch:
 
     def _check_length(self, seconds: float) -> None:
         stop = seconds if self._end is None else min(seconds, self._end)
-        if stop - self._start > MAX_SECONDS + 1 / self._source.fps:
-            raise _too_long(self._name)
+        if stop - self._start > MAX_SECONDS * self._speed + 1 / self._source.fps:
+            raise _too_long(self._name, self._speed)
 
 
 class StoredCheck:
@@ -180,27 +192,6 @@ def _thumb(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-def check_options(
-    *,
-    start: float | None,
-    end: float | None,
-    crop: tuple[int, int, int, int] | None,
-    fps: float,
-) -> None:
-    """Raises UserError for options that are wrong for any video."""
-    if not 1 <= fps <= 120:
-        raise UserError(f"--fps must be from 1 to 120 frames per second, got {fps:g}")
-    if start is not None and not (math.isfinite(start) and start >= 0):
-        raise UserError(f"--start must be 0 seconds or more, got {start:g}")
-    if end is not None and not end > (start or 0.0):
-        raise UserError(f"--end must be later than --start ({start or 0:g} s), got {end:g}")
-    if crop is not None and (min(crop[:2]) < 0 or min(crop[2:]) < MIN_SIDE):
-        raise UserError(
-            "--crop is x,y,width,height in pixels, with x and y 0 or more and at least "
-            f"{MIN_SIDE} x {MIN_SIDE} pixels, got {','.join(map(str, crop))}"
-        )
-
-
 def check_size(name: str, width: int, height: int, crop: tuple[int, int, int, int] | None) -> None:
     """Raises UserError if the picture is too large, small or long, or the crop reaches outside it."""
     if max(width, height) > MAX_SIDE:
@@ -222,29 +213,22 @@ def check_size(name: str, width: int, height: int, crop: tuple[int, int, int, in
         )
 
 
-def check_length(name: str, seconds: float, *, start: float, end: float | None) -> None:
+def check_length(name: str, seconds: float, *, start: float, end: float | None, speed: float = 1.0) -> None:
     """By the container's own word, before hours of video are decoded."""
     if not seconds:
         return
     if start >= seconds + 1:
         raise UserError(f"--start {start:g} is past the end of {name}, which lasts {seconds:.2f} s")
     # A second of slack: a container may count wrong, and each frame's own stamp is checked later.
-    if min(seconds, math.inf if end is None else end) - start > MAX_SECONDS + 1:
-        raise _too_long(name)
+    if min(seconds, math.inf if end is None else end) - start > MAX_SECONDS * speed + 1:
+        raise _too_long(name, speed)
 
 
-def _too_long(name: str) -> UserError:
-    return UserError(f"{name} is longer than {MAX_SECONDS:g} s; choose a part of it with --start and --end")
+def _too_long(name: str, speed: float) -> UserError:
+    return UserError(
+        f"{name} is longer than {MAX_SECONDS:g} s{_at(speed)}; choose a part of it with --start and --end"
+    )
 
 
-def read_crop(text: str) -> tuple[int, int, int, int]:
-    """What somebody has typed as the part of a video to use: x, y, width, height in pixels.
-
-    Raises:
-        ValueError: If it is not four whole numbers.
-    """
-    try:
-        x, y, width, height = (int(part) for part in text.split(","))
-    except ValueError:
-        raise ValueError(f"must be four whole numbers X,Y,W,H, got {text!r}") from None
-    return x, y, width, height
+def _at(speed: float) -> str:
+    return "" if speed == 1 else f" at --speed {speed:g}"

@@ -1,10 +1,8 @@
-"""The library of demos: bring a video in, normalise it, list, find, read.
+"""The library of demos: bring a video in, name it, list, find, read.
 
 A demo is a directory ``<demos_dir>/<sha256>/`` with ``video.webm`` and ``demo.json``; the ones that
-come with the program are ``static/demos/<name>.webm`` and ``<name>.json``. What a demo is, is its pictures:
-``sha256`` is of the frames as they were handed to the encoder, so that the same video gives the same demo
-anywhere, and ``video_sha256`` is of the file. In demos of before 2026-11-29, and in the built-in ones,
-``sha256`` is of the file.
+come with the program are ``static/demos/<name>.webm`` and ``<name>.json``. What is in them, and how it comes
+about, is in ``preparing``.
 
 Shapes: n frames, H rows, W columns, T control steps, q positions.
 """
@@ -12,18 +10,17 @@ Shapes: n frames, H rows, W columns, T control steps, q positions.
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
 import logging
 import math
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, closing
-from dataclasses import asdict, replace
+from contextlib import AbstractContextManager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,16 +29,18 @@ from onedemo.core.directories import Workshop, make_directory, sync_directory
 from onedemo.core.files import hold, write_atomic
 from onedemo.core.names import check_name, check_new_name
 from onedemo.demos.containers import check_file
+from onedemo.demos.edits import Options, check_options
 from onedemo.demos.frame_clock import steps_of_frames
-from onedemo.demos.import_checks import StoredCheck, check_options
-from onedemo.demos.sandboxed_decoder import DECODING, Limits, Options, decode
+from onedemo.demos.preparing import ABOUT, VIDEO, demo_of, describe, origin_of, prepare_demo, sha256_of
+from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.demos.video import VideoReader, jpeg, write_webm
 from onedemo.errors import UserError
 from onedemo.types import Demo
 
+if TYPE_CHECKING:
+    from onedemo.robots.robot import Robot
+
 BUILT_IN = Path(static.__file__).parent / "demos"
-_VIDEO, _ABOUT = "video.webm", "demo.json"
-"""The two files of a demo of the library."""
 
 _log = logging.getLogger(__name__)
 
@@ -56,6 +55,12 @@ def import_video(
     crop: tuple[int, int, int, int] | None = None,
     mirror: bool = False,
     fps: float = 30.0,
+    speed: float = 1.0,
+    reverse: bool = False,
+    loop: int = 1,
+    rotate: int = 0,
+    track: bool = False,
+    stabilise: bool = False,
     task: str = "",
     source: str = "",
     limits: Limits | None = None,
@@ -74,6 +79,12 @@ def import_video(
         crop: (x, y, width, height) of the part to use, pixels of the upright source.
         mirror: Swap left and right.
         fps: Frame rate to bring it to, 1..120.
+        speed: How many times faster it is played, 0.1..20.
+        reverse: Play it backwards.
+        loop: How many times it is shown, end to end; 0: as often as fits into 8 s.
+        rotate: Degrees clockwise: 0, 90, 180 or 270.
+        track: Let a crop of fixed size follow what moves: ``crop`` what moves in it at first.
+        stabilise: Hold the background still.
         task: The hand-coded reward that describes the move, if known.
         source: Where the video is from; its file name if empty.
         limits: What decoding it may take; the defaults if None.
@@ -87,11 +98,14 @@ def import_video(
     """
     path, demos_dir = Path(path), Path(demos_dir)
     check_new_name(check_name(name))
-    check_options(start=start, end=end, crop=crop, fps=fps)
+    options = Options(
+        start=start, end=end, crop=crop, mirror=mirror, fps=fps, speed=speed, reverse=reverse, loop=loop,
+        rotate=rotate, track=track, stabilise=stabilise,
+    )  # fmt: skip
+    check_options(options)
     check_file(path)
-    options = Options(start=start, end=end, crop=crop, mirror=mirror, fps=fps)
     stored = list(_load_all(demos_dir))
-    origin = _origin(path, options)
+    origin = origin_of(path, options)
     for demo, about in stored:
         if {key: about.get(key) for key in origin} == origin:
             return demo
@@ -107,56 +121,6 @@ def import_video(
         return keep_demo(workshop, name, demos_dir)
 
 
-def prepare_demo(
-    path: Path,
-    options: Options,
-    place: Path,
-    *,
-    task: str = "",
-    source: str,
-    limits: Limits | None = None,
-    warn: Callable[[str], object] = lambda _: None,
-) -> Demo:
-    """Brings a video in as a demo that is not kept yet, nor named: its files are in ``place`` afterwards.
-
-    Args:
-        path: The video; ``check_file`` and ``check_options`` have found nothing wrong.
-        options: Which part of it, and how.
-        place: An empty directory on the file system of the library.
-        task: The hand-coded reward that describes the move, if known.
-        source: Where the video is from.
-        limits: What decoding it may take; the defaults if None.
-        warn: Called with each sentence about what is not as it should be, though usable.
-
-    Returns:
-        The demo, without a name.
-
-    Raises:
-        UserError: If the video is unusable.
-    """
-    video = place / _VIDEO
-    check, pictures = StoredCheck(), hashlib.sha256(f"{options.fps:g}".encode())
-    with closing(decode(path, options, limits, warn)) as frames:
-        count = write_webm(video, _noting(frames, check, pictures), fps=options.fps)
-    check.check_pictures(str(path))
-    with VideoReader(video) as reader:
-        for frame in reader.frames():
-            check.stored(frame)
-    about = _describe(
-        place / _ABOUT,
-        video,
-        name="",
-        sha256=pictures.hexdigest(),
-        video_sha256=_sha256(video),
-        fps=options.fps,
-        frames=count,
-        task=task,
-        source=source,
-        **_origin(path, options),
-    )
-    return _demo(about, video)
-
-
 def keep_demo(place: Path, name: str, demos_dir: Path) -> Demo:
     """Makes what was prepared a demo; gives the one there is if it has the same pictures.
 
@@ -170,17 +134,17 @@ def keep_demo(place: Path, name: str, demos_dir: Path) -> Demo:
     """
     check_new_name(check_name(name))
     make_directory(demos_dir, private=True)
-    about = json.loads((place / _ABOUT).read_bytes()) | {"name": name}
+    about = json.loads((place / ABOUT).read_bytes()) | {"name": name}
     with _names(demos_dir):  # somebody else may have added one meanwhile
         if known := known_demo(about["sha256"], demos_dir):
             return known
         _check_free(name, list_demos(demos_dir))
-        write_atomic(place / _ABOUT, json.dumps(about, indent=1).encode() + b"\n")
+        write_atomic(place / ABOUT, json.dumps(about, indent=1).encode() + b"\n")
         final = demos_dir / about["sha256"]
         shutil.rmtree(final, ignore_errors=True)  # what a deleted demo left behind
         os.replace(place, final)
         sync_directory(demos_dir)
-    return _demo(about, final / _VIDEO)
+    return demo_of(about, final / VIDEO)
 
 
 def known_demo(sha256: str, demos_dir: Path) -> Demo | None:
@@ -196,12 +160,6 @@ def demo_picture(demo: Demo, width: int = 320) -> bytes:
     """
     middle = next(islice(stream_frames(demo), demo.frames // 2, None))
     return jpeg(middle, width)
-
-
-def _origin(path: Path, options: Options) -> dict[str, Any]:
-    """What a demo was made of, and how: of the same, the frames are the same and need not be decoded."""
-    wanted = asdict(options) | {"crop": list(options.crop) if options.crop else None}
-    return {"source_sha256": _sha256(path), "options": wanted, "decoding": DECODING}
 
 
 def remove_demo(demo: Demo, demos_dir: Path) -> None:
@@ -226,7 +184,7 @@ def rename_demo(demo: Demo, name: str, demos_dir: Path) -> Demo:
         UserError: If it came with the program, or the name is not allowed or taken.
     """
     check_new_name(check_name(name))
-    path = _own_directory(demo, demos_dir) / _ABOUT
+    path = _own_directory(demo, demos_dir) / ABOUT
     with _names(demos_dir):
         _check_free(name, list_demos(demos_dir))
         about = json.loads(path.read_bytes()) | {"name": name}
@@ -241,7 +199,7 @@ def render_demo(
     task: str,
     source: str,
     out_dir: Path = BUILT_IN,
-    dt: float = 0.008,
+    robot: Robot | None = None,
     fps: float = 30.0,
 ) -> Demo:
     """Films stored positions: ``<out_dir>/<name>.webm`` and ``<name>.json``, 480 x 360.
@@ -252,7 +210,7 @@ def render_demo(
         task: The hand-coded reward that describes the move.
         source: The command or study that made the motion.
         out_dir: Where to write; overwrites files of the same name.
-        dt: Seconds per control step.
+        robot: Whose positions; the hopper's if None.
         fps: Frames per second.
 
     Returns:
@@ -262,30 +220,34 @@ def render_demo(
         UserError: If the name is not allowed or this machine cannot draw.
     """
     from onedemo.render.renderer import Renderer
+    from onedemo.robots.registry import DEFAULT, robot_named
 
     check_name(name)
+    robot = robot or robot_named(DEFAULT)
+    dt = robot.dt
     count = math.floor(len(qpos_Tq) * dt * fps + 1e-9)
     steps = np.minimum(steps_of_frames(count, dt, fps), len(qpos_Tq) - 1)
-    with Renderer() as renderer:
+    with Renderer(robot=robot) as renderer:
         frames = renderer.render(np.asarray(qpos_Tq)[steps])
     out_dir.mkdir(parents=True, exist_ok=True)
     temporary = out_dir / f".{name}.partial.webm"
     try:
         write_webm(temporary, frames, fps=fps)
-        about = _describe(
+        about = describe(
             out_dir / f"{name}.json",
             temporary,
             name=name,
-            sha256=_sha256(temporary),
+            sha256=sha256_of(temporary),
             fps=fps,
             frames=count,
             task=task,
             source=source,
+            robot=robot.name,
         )
         os.replace(temporary, out_dir / f"{name}.webm")
     finally:
         temporary.unlink(missing_ok=True)
-    return _demo(about, out_dir / f"{name}.webm")
+    return demo_of(about, out_dir / f"{name}.webm")
 
 
 def list_demos(demos_dir: Path) -> list[Demo]:
@@ -300,10 +262,10 @@ def built_in() -> list[Demo]:
 
 def is_whole(demo: Demo) -> bool:
     """Whether the stored video is, to the byte, what was stored."""
-    about = demo.path.with_name(_ABOUT) if demo.path.name == _VIDEO else demo.path.with_suffix(".json")
+    about = demo.path.with_name(ABOUT) if demo.path.name == VIDEO else demo.path.with_suffix(".json")
     try:
         known = json.loads(about.read_bytes())
-        return _sha256(demo.path) == known.get("video_sha256", known["sha256"])
+        return sha256_of(demo.path) == known.get("video_sha256", known["sha256"])
     except (OSError, ValueError, KeyError):
         return False
 
@@ -373,21 +335,11 @@ def show(demo: Demo) -> str:
         "size": f"{demo.width} x {demo.height} pixels",
         "task": demo.task or "not named",
         "source": demo.source or "not named",
+        "edits": demo.edits or "none",
         "file": str(demo.path),
         "sha256": demo.sha256,
     }
     return "\n".join(f"{key:<7} {value}" for key, value in lines.items())
-
-
-def _noting(
-    frames: Iterable[np.ndarray], check: StoredCheck, pictures: hashlib._Hash
-) -> Iterator[np.ndarray]:
-    """The same frames; what they show is noted on the way."""
-    for number, frame in enumerate(frames):
-        if number == 0:
-            pictures.update(str(frame.shape).encode())
-        pictures.update(frame.data)
-        yield check.given(frame)
 
 
 def _names(demos_dir: Path) -> AbstractContextManager[None]:
@@ -408,45 +360,16 @@ def _own_directory(demo: Demo, demos_dir: Path) -> Path:
     return directory
 
 
-def _describe(path: Path, video: Path, **about: Any) -> dict[str, Any]:
-    """Writes the demo's JSON and returns it."""
-    with VideoReader(video) as reader:
-        about |= {"width": reader.width, "height": reader.height}
-    write_atomic(path, json.dumps(about, indent=1).encode() + b"\n")
-    video.chmod(path.stat().st_mode & 0o777)  # OpenCV lets everybody read it
-    return about
-
-
 def _load_all(demos_dir: Path) -> Iterator[tuple[Demo, dict[str, Any]]]:
     places = [(path, path.with_suffix(".webm")) for path in sorted(BUILT_IN.glob("*.json"))]
-    for path in sorted(demos_dir.glob(f"*/{_ABOUT}")):
+    for path in sorted(demos_dir.glob(f"*/{ABOUT}")):
         if not path.parent.name.startswith("."):
-            places.append((path, path.parent / _VIDEO))
+            places.append((path, path.parent / VIDEO))
     for path, video in places:
         try:
             about = json.loads(path.read_bytes())
             if not video.is_file():
                 raise FileNotFoundError(video)
-            yield _demo(about, video), about
+            yield demo_of(about, video), about
         except (OSError, ValueError, KeyError, TypeError) as error:
             _log.warning("demo left out, %s is damaged: %r", path, error)
-
-
-def _demo(about: dict[str, Any], video: Path) -> Demo:
-    return Demo(
-        name=str(about["name"]),
-        sha256=str(about["sha256"]),
-        path=video,
-        fps=float(about["fps"]),
-        frames=int(about["frames"]),
-        width=int(about["width"]),
-        height=int(about["height"]),
-        task=str(about.get("task", "")),
-        robot=str(about.get("robot", "")),
-        source=str(about.get("source", "")),
-    )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

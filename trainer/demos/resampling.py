@@ -30,7 +30,7 @@ _T = TypeVar("_T")
 
 def resample(
     stamped: Iterable[tuple[float, _T]], *, fps: float, lasts: Callable[[], float], start: float,
-    end: float,
+    end: float, speed: float = 1.0,
 ) -> Iterator[_T]:  # fmt: skip
     """Brings pictures with time stamps to a fixed rate.
 
@@ -40,16 +40,18 @@ def resample(
         lasts: Gives, when the others are through, how long the last picture stays on screen, seconds.
         start: First moment wanted, seconds.
         end: Last moment wanted, seconds (infinity: all there is).
+        speed: Seconds of the source that one second shows.
 
     Yields:
         Pictures.
     """
-    source = iter(stamped)
+    source = ((seconds / speed, picture) for seconds, picture in stamped)
+    start, end, slack = start / speed, end / speed, _SLACK / speed
     before: deque[float] = deque(maxlen=_BEFORE)
     shown: list[tuple[float, _T]] = []
     ahead: deque[tuple[float, _T]] = deque()
     for seconds, picture in source:  # up to the last that is not later than the start
-        if shown and seconds > start + _SLACK:
+        if shown and seconds > start + slack:
             ahead.append((seconds, picture))
             break
         before.append(seconds)
@@ -66,7 +68,7 @@ def resample(
         first, step = grid
         base = first + math.floor((start - first) / step + 0.25) * step
         offset = step / 2 / _repeats(1 / (step * fps))
-    wanted = math.ceil((end - start - _SLACK) * fps) if end < math.inf else math.inf
+    wanted = math.ceil((end - start - slack) * fps) if end < math.inf else math.inf
     count, (last, picture) = 0, shown[0]
     while count < wanted:
         if not ahead:
@@ -81,7 +83,7 @@ def resample(
     else:
         return
     # The last picture stays for its own time; rounding keeps 240 pictures 240.
-    stop = min(last + lasts() - base, end - start)
+    stop = min(last + lasts() / speed - base, end - start)
     while (count + 0.5) / fps <= stop:
         yield picture
         count += 1
@@ -109,3 +111,42 @@ def _usual(steps: np.ndarray) -> float:
 def _repeats(ratio: float) -> int:
     """After how many outputs they fall on the source's pictures as before: q for a ratio of about p / q."""
     return next((q for q in range(1, 8) if abs(ratio - round(ratio * q) / q) < 0.05 * ratio), 8)
+
+
+def arranged(
+    play: Callable[[int, int | None], Iterator[np.ndarray]], times: Callable[[int], int], *, reverse: bool,
+    room: int,
+) -> Iterator[np.ndarray]:  # fmt: skip
+    """A sequence of pictures several times, or backwards, without all of it in memory.
+
+    Args:
+        play: Gives the pictures from one number up to another, or to the end, in order, as often as asked.
+        times: Told how many there are, says how often they are wanted.
+        reverse: Each time from the last to the first.
+        room: Bytes of pictures that are kept; of what is longer, parts are played again.
+
+    Yields:
+        Pictures; one that follows itself is the same array.
+    """
+    kept: list[np.ndarray] = []
+    count = size = largest = 0
+    before = None
+    for picture in play(0, None):
+        count += 1
+        if picture is not before:
+            before, largest = picture, max(largest, picture.nbytes)
+            size += picture.nbytes
+        if size <= room:
+            kept.append(picture)
+        else:
+            kept.clear()
+    wanted = times(count)
+    at_once = max(1, room // max(1, largest))
+    for _ in range(wanted):
+        if len(kept) == count:
+            yield from reversed(kept) if reverse else kept
+        elif not reverse:
+            yield from play(0, None)
+        else:
+            for last in range(count, 0, -at_once):
+                yield from reversed(list(play(max(0, last - at_once), last)))

@@ -27,14 +27,15 @@ import sys
 import threading
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from onedemo.demos.containers import CONVERT
-from onedemo.demos.import_checks import MAX_SECONDS, STORED_SIDE
+from onedemo.demos.edits import Options
+from onedemo.demos.import_checks import STORED_SIDE
 from onedemo.errors import UserError
 
 DECODING = 2
@@ -48,6 +49,8 @@ MAX_SENTENCE = 2000
 _LIBRARIES = ("LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "DYLD_FALLBACK_LIBRARY_PATH")
 _FEW_THREADS = {"OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "MALLOC_ARENA_MAX": "2"}
 """Else each core of the machine brings threads, and each thread an arena of 64 MB."""
+_NO_GRAPHICS = {"MUJOCO_GL": "disable"}
+"""MuJoCo, which comes with what finds a mover, would look for a graphics driver."""
 _log = logging.getLogger(__name__)
 
 
@@ -63,27 +66,6 @@ class Limits:
     """Of all its threads together."""
     wall_seconds: float = 300
     """From its start to its last frame."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Options:
-    """Which part of a video is wanted, and how, as checked by ``onedemo.demos.import_checks``."""
-
-    start: float | None = None
-    """Seconds."""
-    end: float | None = None
-    """Seconds."""
-    crop: tuple[int, int, int, int] | None = None
-    """x, y, width, height, pixels of the upright source."""
-    mirror: bool = False
-    """Swap left and right."""
-    fps: float = 30.0
-    """Frames per second."""
-
-    @property
-    def most_frames(self) -> int:
-        """More than a whole demo can have."""
-        return math.ceil((MAX_SECONDS + 3) * self.fps) + 2
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -154,7 +136,7 @@ def _run_child(
             "(on Windows: in WSL 2)"
         )
     root = str(Path(__file__).resolve().parents[2])
-    told = json.dumps([str(path), _plain(options), limits.memory, limits.cpu_seconds, look])
+    told = json.dumps([str(path), asdict(options), limits.memory, limits.cpu_seconds, look])
     surroundings = {name: os.environ[name] for name in _LIBRARIES if name in os.environ}
     complaints, complaining = os.pipe()
     os.set_blocking(complaints, False)
@@ -169,7 +151,7 @@ def _run_child(
                 cwd="/",
                 # Nothing of this process's surroundings, least of all a secret in a variable, but for
                 # where a Python without a fixed place finds its library.
-                env=surroundings | {"PYTHONPATH": root} | _FEW_THREADS,
+                env=surroundings | {"PYTHONPATH": root} | _FEW_THREADS | _NO_GRAPHICS,
                 start_new_session=True,
             )
     except BaseException as error:
@@ -267,7 +249,3 @@ def _explain(path: Path, code: int | None, late: bool, limits: Limits, last: str
         name = signal.Signals(-code).name if code is not None and code < 0 else f"status {code}"
         why = f"the process that decodes it ended with {name}, as damaged videos make it"
     return UserError(f"{path} cannot be decoded: {why}; a plain video may help: {CONVERT}")
-
-
-def _plain(options: Options) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in ("start", "end", "crop", "mirror", "fps")}

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from onedemo.demos.ground_truth import hidden_path, load_hidden
+import numpy as np
+
+from onedemo.demos.frame_clock import frame_of_step
+from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden
 from onedemo.errors import UserError
+from onedemo.reward.model import Snapshot
 from onedemo.sim.task_rewards import TASK_REWARDS, task_reward
 from onedemo.types import Demo
 
@@ -17,8 +21,37 @@ def true_reward_of(demo: Demo) -> float | None:
     """
     if demo.task not in TASK_REWARDS:
         return None
-    try:
-        states = load_hidden(hidden_path(demo.path))
-    except UserError:
+    states = _states(demo)
+    if states is None:
         return None
     return float(task_reward(demo.task, states.obs, states.actions, states.qpos, states.qvel).sum())
+
+
+def predicted_rating_of(demo: Demo, snapshot: Snapshot, dt: float) -> float | None:
+    """The rating that a reward model predicts for the movement in the demo itself, the mean over it.
+
+    For kinds that cannot tell it from the video alone (``Snapshot.best``).
+
+    Args:
+        demo: What is learned.
+        snapshot: Fitted beside it.
+        dt: Seconds of a control step.
+
+    Returns:
+        1..5; None where the states behind the video are not known, or are another robot's.
+    """
+    states = _states(demo)
+    if states is None:
+        return None
+    frames = frame_of_step(np.arange(1, len(states.obs)), dt, demo.fps, demo.frames)
+    try:
+        return float(snapshot.ratings(frames, states.obs[1:], states.actions).mean())
+    except (RuntimeError, ValueError):  # its arrays have other widths
+        return None
+
+
+def _states(demo: Demo) -> HiddenStates | None:
+    try:
+        return load_hidden(hidden_path(demo.path))
+    except UserError:
+        return None

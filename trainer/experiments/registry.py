@@ -32,6 +32,9 @@ TABLES = {
     ),
     "ratings": Entry("onedemo.experiments.tables.ratings", "how much is learned from how many ratings"),
     "person": Entry("onedemo.experiments.tables.person", "learning from a video of a real person"),
+    "pose": Entry(
+        "onedemo.experiments.tables.pose", "how well the pose is read from others' videos of a robot"
+    ),
     "ablation": Entry("onedemo.experiments.tables.ablation", "what each part of the method contributes"),
 }
 """``onedemo bench NAME``; a new table is one module and one line here."""

@@ -49,6 +49,7 @@ KINDS = {
     "predictor": Kind("onedemo.experiments.jobs.predictor_trial:run", version=2),
     "handcoded": Kind("onedemo.experiments.jobs.controls:handcoded"),
     "preferences": Kind("onedemo.experiments.jobs.controls:preferences"),
+    "pose": Kind("onedemo.experiments.jobs.pose:run"),
     "truth": Kind("onedemo.experiments.jobs.controls:truth"),
 }
 """By name; a new kind is one line here. "module:function" itself can stand for a kind, too.

@@ -25,7 +25,6 @@ LANE = np.array((222, 227, 233), np.float32)
 SHADOW = np.array((38, 48, 66), np.float32)
 
 _LANE_HALF_WIDTH = 0.33
-_EDGE_HALF_WIDTH = 0.012
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -28,6 +28,7 @@ from onedemo.render.renderer import (
     CloseUp,
     Renderer,
 )
+from onedemo.render.stage import Shape
 from onedemo.robots.camera import Camera
 from onedemo.robots.robot import Robot, body_name, model_of
 from onedemo.sim.kinematics import body_of
@@ -89,7 +90,7 @@ def views_of(extents: Sequence[Extent], size: float = 1.0) -> list[View]:
         [e.low for e in extents], [e.high for e in extents]
     )  # fmt: skip
     bottoms = [
-        -_BELOW * size if extent.grounded and near < level else near - _ABOVE * size
+        min(near - _ABOVE * size, -_BELOW * size if extent.grounded and near < level else np.inf)
         for extent, near in zip(extents, lows, strict=True)
     ]
     tall = max(high + _ABOVE * size - bottom for high, bottom in zip(highs, bottoms, strict=True))
@@ -239,15 +240,21 @@ class _Track:
 
     @staticmethod
     def of(renderer: Renderer, qpos: np.ndarray) -> _Track:
-        shapes, camera = renderer.shapes(qpos), renderer.robot.camera
-        low = np.stack([shape.low[:, (0, 2)].min(axis=0) for shape in shapes])
-        high = np.stack([shape.high[:, (0, 2)].max(axis=0) for shape in shapes])
+        camera = renderer.robot.camera
         if not camera.follows:
             aim = np.full((len(qpos), 2), (camera.middle, camera.height))
         else:  # the mean of its limbs: steadier than the edges of what it reaches
             ends = np.stack(list(body_of(renderer.robot).points(qpos).values()))
             aim = ends.mean(axis=(0, 2))
-        return _Track(qpos, low, high, aim[:, 0], aim[:, 1] if camera.up != 2 else None)
+        above = camera.up != 2
+        # As large as it is seen in the plane that the view has the scale of.
+        eyes = aim if above else np.stack([aim[:, 0], np.full(len(qpos), camera.height)], axis=1)
+        edges = [
+            _seen_at(shape, eye, camera.distance)
+            for shape, eye in zip(renderer.shapes(qpos), eyes, strict=True)
+        ]
+        low, high = (np.stack(some) for some in zip(*edges, strict=True))
+        return _Track(qpos, low, high, aim[:, 0], aim[:, 1] if above else None)
 
     @property
     def extent(self) -> Extent:
@@ -257,6 +264,15 @@ class _Track:
             low=float((self.low[:, 1] - rise).min()), high=float((self.high[:, 1] - rise).max()),
             grounded=self.rise is None,
         )  # fmt: skip
+
+
+def _seen_at(shape: Shape, eye: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the most x and z, (2,) each, that a camera at ``eye`` sees parts at."""
+    scales = [
+        distance / np.maximum(distance + depth[:, 1:2], 0.1 * distance) for depth in (shape.low, shape.high)
+    ]
+    ends = [eye + (side[:, (0, 2)] - eye) * scale for side in (shape.low, shape.high) for scale in scales]
+    return np.min(ends, axis=(0, 1)), np.max(ends, axis=(0, 1))
 
 
 def _drawn(renderer: Renderer, track: _Track, view: View) -> Side:

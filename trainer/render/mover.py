@@ -94,18 +94,12 @@ def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     view = studio(width, height, camera)
     box = np.full((len(frames), 4), np.nan)
     torso, foot = np.full((len(frames), 4), np.nan), np.full((len(frames), 2), np.nan)
-    place = np.zeros(len(frames))
+    solids = np.stack([solid_in_studio(frame) for frame in frames])
     outlines: list[np.ndarray] = []
     colours = np.asarray(LIMB_COLOURS) - np.mean(LIMB_COLOURS, axis=1, keepdims=True)
     colours = (colours / np.linalg.norm(colours, axis=1, keepdims=True)).astype(np.float32)
-    pattern = _floor_pattern(height, width, camera)
-    for index, frame in enumerate(frames):
-        red, green, blue = cv2.split(frame)
-        bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
-        solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
-        solid = cv2.morphologyEx(solid, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    for index, (frame, solid) in enumerate(zip(frames, solids, strict=True)):
         outlines.append(_outline(cv2.medianBlur(solid, 5)))
-        place[index] = _place(green, solid, pattern)
         columns, rows = (
             np.reshape(cv2.findNonZero(solid), (-1, 2)).T if solid.any() else np.empty((2, 0), int)
         )
@@ -123,12 +117,34 @@ def _in_studio(frames: np.ndarray, robot: Robot) -> Mover | None:
     top = height - (camera.height + free_above(camera) - 0.03 * camera.size - view.bottom) * view.scale
     if np.isnan(box[:, 0]).mean() > 0.3 or (box[:, 1] < top).any():
         return None
-    way = np.unwrap(place, period=2) * camera.unit
     return Mover(
         scale=view.scale, floor=height + view.bottom * view.scale, box=_filled(box),
-        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot), way=way - way[0],
-        outlines=tuple(outlines),
+        aim=np.full(len(frames), width / 2), head=_filled(_ends(torso)), foot=_filled(foot),
+        way=way_in_studio(frames, solids, camera), outlines=tuple(outlines),
     )  # fmt: skip
+
+
+def solid_in_studio(frame: np.ndarray) -> np.ndarray:
+    """What of a picture of the studio, (H, W, 3), is the robot, (H, W), uint8 0 or 1, by colour."""
+    red, green, blue = cv2.split(frame)
+    bright, faint = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
+    solid = cv2.threshold(cv2.subtract(bright, faint), 45, 1, cv2.THRESH_BINARY)[1]
+    return cv2.medianBlur(solid, 3)
+
+
+def way_in_studio(frames: np.ndarray, solids: np.ndarray, camera: Camera | None = None) -> np.ndarray:
+    """Metres that the studio's camera has gone along the track since the first picture, (F,).
+
+    Args:
+        frames: (F, H, W, 3), uint8 RGB.
+        solids: Where the floor is not seen, (F, H, W), uint8 0 or 1.
+        camera: The studio's; the hopper's if None.
+    """
+    camera = camera or robot_named(DEFAULT).camera
+    pattern = _floor_pattern(*frames.shape[1:3], camera)
+    places = [_place(frame[..., 1], solid, pattern) for frame, solid in zip(frames, solids, strict=True)]
+    way = np.unwrap(places, period=2) * camera.unit
+    return way - way[0]
 
 
 def _rod(limb: np.ndarray, rest: np.ndarray) -> np.ndarray:

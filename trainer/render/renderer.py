@@ -171,8 +171,16 @@ class Renderer:
         return images
 
     def shapes(self, qpos_kq: np.ndarray) -> list[Shape]:
-        """How far the robot's geoms reach at each of some positions, (k, q)."""
-        return [self._stage.pose(self._data, qpos) for qpos in np.asarray(qpos_kq, np.float64)]
+        """How far the robot's geoms reach at each of some positions, (k, q).
+
+        Places away from the camera are counted from the plane that it is ``Camera.distance`` before.
+        """
+        found = []
+        for qpos in np.asarray(qpos_kq, np.float64):
+            shape = self._stage.pose(self._data, qpos)
+            plane = np.array([0.0, self._stage.eye(self._data, shape).y, 0.0])
+            found.append(Shape(shape.low - plane, shape.high - plane))
+        return found
 
     def outline(self, qpos: np.ndarray) -> np.ndarray:
         """The border of the robot at some positions, (q,): right and above the floor, metres, (n, 2)."""

@@ -7,6 +7,8 @@ differ in lightness as well as in hue, for those who see no red or no green.
 
 from __future__ import annotations
 
+import warnings
+
 import mujoco
 import numpy as np
 
@@ -19,7 +21,7 @@ _TRUNK = (LIMB_COLOURS[0], (0.66, 0.17, 0.13))
 _CHAINS = (
     LIMB_COLOURS[1:],
     ((0.04, 0.33, 0.27), (0.09, 0.60, 0.45), (0.66, 0.90, 0.78)),
-    ((0.34, 0.14, 0.42), (0.66, 0.38, 0.67), (0.95, 0.72, 0.86)),
+    ((0.58, 0.22, 0.58), (0.80, 0.50, 0.80), (0.97, 0.78, 0.92)),
     ((0.36, 0.23, 0.10), (0.66, 0.46, 0.24), (0.91, 0.79, 0.58)),
 )
 _SCENERY = (0.70, 0.74, 0.79)
@@ -97,7 +99,9 @@ def studio_model(robot: Robot, *, width: int, height: int) -> mujoco.MjModel:
     spec.worldbody.add_camera(name=EYE, fovy=FOVY)
     for geom in spec.geoms:
         geom.material = ""
-    model = spec.compile()
+    with warnings.catch_warnings():  # of what is deprecated in a model
+        warnings.simplefilter("ignore")
+        model = spec.compile()
     seen = visible_geoms(model)
     model.geom_rgba[:, :3] = colours_of(robot, model)
     model.geom_rgba[:, 3] = 0

@@ -37,12 +37,12 @@ _MOVE_COST = 0.02
 """Similarity that a move must gain to be taken over one step: without it the clock would tremble."""
 _FRESH = 0.6
 """Running similarity at the start of an episode."""
-_MEMORY = 25.0
-"""Control steps over which the running similarity is taken."""
-_GRACE = 10
-"""Control steps before an episode may end early."""
-_BUFFER_EVERY = 20
-"""Control steps of the demo between entries of the reset buffer."""
+_MEMORY_SECONDS = 0.2
+"""Over which the running similarity is taken."""
+_GRACE_SECONDS = 0.08
+"""Before an episode may end early."""
+_BUFFER_SECONDS = 0.16
+"""Of the demo between entries of the reset buffer."""
 _BUFFER_KEPT = 12
 """For each of them so many states are kept, the ones most like it."""
 
@@ -69,6 +69,7 @@ def fill_reset_buffer(
     rng: np.random.Generator,
     *,
     tries: int,
+    dt: float,
 ) -> ResetBuffer:
     """Picks, for moments all over the demo, the states that the predictor rates best there.
 
@@ -79,9 +80,11 @@ def fill_reset_buffer(
         demo_steps: Control steps of the demo.
         rng: Draws the states that are tried.
         tries: How many at each moment.
+        dt: Seconds of a control step.
     """
     flat = {name: getattr(states, name).reshape(-1, getattr(states, name).shape[-1]) for name in _STATE}
-    moments = np.arange(0, max(1, demo_steps - 2 * _BUFFER_EVERY), _BUFFER_EVERY)
+    every = steps_in(_BUFFER_SECONDS, dt)
+    moments = np.arange(0, max(1, demo_steps - 2 * every), every)
     kept, ratings = [], []
     for moment in moments:
         tried = rng.integers(len(flat["obs"]), size=tries)
@@ -124,6 +127,7 @@ class PracticeRules(EpisodeRules):
     ) -> None:
         self._config = config
         self._slack = round(config.slack_seconds / dt)
+        self._memory, self._grace = steps_in(_MEMORY_SECONDS, dt), steps_in(_GRACE_SECONDS, dt)
         self._demo_steps = demo_steps
         self._frames_of = frames_of
         self._snapshot: Snapshot | None = None
@@ -174,9 +178,9 @@ class PracticeRules(EpisodeRules):
         """True where the robot has been unlike the demo for a while."""
         if not self._config.give_up:
             return super().stop(step, next_clock)
-        self._running += (self._similar[-1] - self._running) / _MEMORY
+        self._running += (self._similar[-1] - self._running) / self._memory
         self._age += 1  # not ``elapsed``, which begins in the middle of the demo with a state of the buffer
-        return (self._running < self._threshold) & (self._age > _GRACE)
+        return (self._running < self._threshold) & (self._age > self._grace)
 
     def score(self, batch: Transitions) -> np.ndarray:
         """Rewards of the steps since the last call: similarity, 0..1, times demo steps moved, (N, T)."""
@@ -202,6 +206,11 @@ class PracticeRules(EpisodeRules):
         assert self._snapshot is not None, "use(snapshot) comes before the first step"
         frames = self._frames_of(np.minimum(clock, self._demo_steps - 1))
         return similarity(self._snapshot.ratings(frames, next_obs, actions))
+
+
+def steps_in(seconds: float, dt: float) -> int:
+    """Control steps of ``dt`` seconds in some time, one at least."""
+    return max(1, round(seconds / dt))
 
 
 def similarity(ratings: np.ndarray) -> np.ndarray:

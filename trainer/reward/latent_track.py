@@ -6,7 +6,8 @@ them locate the frame among the robot's poses, as distances to masts locate a re
 alike, or follow each other, are taken to be alike: the track is a Gaussian process over the demo's frames
 (Rasmussen and Williams 2006, section 2.1, in its weight-space view), and its motion is its own change.
 
-Shapes: F demo frames, R basis functions, P = 9 numbers of a pose, B = 2 P with the motion.
+Shapes: F demo frames, R basis functions, A axes and K ends that are compared, P = 1 + 2 A + 2 K numbers of a
+pose, B = 2 P with the motion.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 
 from onedemo.reward.model import visual_inputs
-from onedemo.sim import kinematics
+from onedemo.sim.kinematics import MOTION_SCALE, Body
 
 _DIMS = 8
 """Principal components of the frame features that say how alike two frames look."""
@@ -30,9 +31,9 @@ _TIME_SHARE = 0.5
 _BASIS = 40
 _SMOOTH = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9
 _AROUND = 2
-"""Frames before and after over which a motion is taken, as in ``trainer/vision/pose_estimator.py``."""
+"""Frames before and after over which a motion is taken."""
 _HEIGHT = 1.0
-"""Pose units (``body.HEIGHT_SCALE``) about which heights vary."""
+"""Pose units (``kinematics.HEIGHT_SCALE``) about which heights vary."""
 _SOFT = 0.05
 """Sines and cosines lie within a circle, on it unless both are small."""
 
@@ -60,16 +61,18 @@ def track_basis(features: np.ndarray, fps: float) -> np.ndarray:
     return np.concatenate([basis, np.ones((len(basis), 1))], axis=1).astype(np.float32)
 
 
-def track_of(basis: torch.Tensor, weights: torch.Tensor, fps: float) -> torch.Tensor:
+def track_of(basis: torch.Tensor, weights: torch.Tensor, fps: float, body: Body) -> torch.Tensor:
     """Pose and motion at each frame, (F, B), from a basis (F, R + 1) and weights (R + 1, P)."""
     free = basis @ weights
-    waves = free[:, 1:].reshape(len(free), -1, 2)
-    waves = waves / (waves.square().sum(-1, keepdim=True) + _SOFT).sqrt()
-    poses = torch.cat([free[:, :1] + _HEIGHT, waves.reshape(len(free), -1)], dim=1)
+    axes = 1 + 2 * len(body.weights)
+    waves = free[:, 1:axes].reshape(len(free), -1, 2)
+    # Seen from the side an axis in space is as long as it is turned away; one in the plane is whole.
+    waves = waves / (waves.square().sum(-1, keepdim=True) + (_SOFT if body.planar else 1.0)).sqrt()
+    poses = torch.cat([free[:, :1] + _HEIGHT, waves.reshape(len(free), -1), free[:, axes:]], dim=1)
     frames = torch.arange(len(poses))
     before, after = (frames - _AROUND).clamp(min=0), (frames + _AROUND).clamp(max=len(poses) - 1)
     seconds = ((after - before).clamp(min=1) / fps)[:, None]
-    return torch.cat([poses, kinematics.MOTION_SCALE * (poses[after] - poses[before]) / seconds], dim=1)
+    return torch.cat([poses, MOTION_SCALE * (poses[after] - poses[before]) / seconds], dim=1)
 
 
 def _gaussian(points: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ other; both are concatenated and pass a fully connected layer, one additional fu
 a softmax over the five ratings. It is trained on single (frame, state-action) pairs, each with the
 rating of its clip, with batches that hold equally many pairs of each rating.
 
-Shapes: n clips, W control steps a clip, F demo frames, V visual dims, S = 15 standard dims.
+Shapes: n clips, W control steps a clip, F demo frames, V visual dims, S standard dims, of a hopper 15.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from onedemo.core import optimisers
 from onedemo.errors import UserError
 from onedemo.reward.model import CLASSES, FitStats, Lens, PredictorConfig, Snapshot, View
 from onedemo.reward.segment_marks import split_marks
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import without_turns
 from onedemo.storage.rating_records import RatedSegment
 
-STANDARD_DIMS = 15
 _JUDGED_CLIPS = 2000
 """Clips behind ``FitStats.accuracy``, at most: a refit must not grow with the ratings."""
 _BOOTSTRAP = 0.85
@@ -36,29 +38,34 @@ _ORDINAL_FALL = 1.5
 """Nats by which a rating is less right than the one next to it that is nearer to the one given."""
 
 
-def standard_inputs(obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def standard_inputs(obs: np.ndarray, actions: np.ndarray, robot: str = "hopper") -> np.ndarray:
     """State and action as the predictor sees them.
 
-    The torso angle enters as sine and cosine, because a robot after one turn looks as before it;
-    velocities are scaled to the size of the rest; actions are clipped to what the motors apply.
+    Angles without an end, such as a torso's, enter as sine and cosine, because a robot after one turn looks
+    as before it; velocities are scaled to the size of the rest; actions are clipped to what the motors apply.
 
     Args:
-        obs: Observations, (..., 11).
-        actions: Actions, (..., 3).
+        obs: Observations, (..., o).
+        actions: Actions, (..., a).
+        robot: Name of the robot.
 
     Returns:
         (..., S), float32.
     """
-    angle = obs[..., 1:2]
-    parts = (
-        obs[..., :1],
-        np.sin(angle),
-        np.cos(angle),
-        obs[..., 2:5],
-        0.2 * obs[..., 5:],
-        np.clip(actions, -1, 1),
-    )
-    return np.concatenate(parts, axis=-1).astype(np.float32)
+    of = robot_named(robot)
+    seen = without_turns(of, obs)
+    at, speeds = np.split(seen, [seen.shape[-1] - of.velocities], axis=-1)
+    return np.concatenate([at, _SPEED * speeds, np.clip(actions, -1, 1)], axis=-1).astype(np.float32)
+
+
+def standard_size(robot: str) -> int:
+    """S of a robot."""
+    of = robot_named(robot)
+    return of.obs_size + len(of.angles) + of.action_size
+
+
+_SPEED = 0.2
+"""A metre or radian per second, beside positions."""
 
 
 class SimilarityNet(nn.Module):
@@ -68,11 +75,13 @@ class SimilarityNet(nn.Module):
     frame alone and can be worked out once per demo.
     """
 
-    def __init__(self, visual_dims: int, config: PredictorConfig, generator: torch.Generator) -> None:
+    def __init__(
+        self, visual_dims: int, standard_dims: int, config: PredictorConfig, generator: torch.Generator
+    ) -> None:
         super().__init__()
         hidden = config.hidden
         self.standard = nn.Sequential(
-            _linear(STANDARD_DIMS, hidden), nn.ReLU(), _linear(hidden, hidden), nn.ReLU()
+            _linear(standard_dims, hidden), nn.ReLU(), _linear(hidden, hidden), nn.ReLU()
         )
         self.fuse_visual = _linear(visual_dims, hidden, bias=False)
         self.fuse_standard = _linear(hidden, hidden)
@@ -103,16 +112,17 @@ class NetworkSnapshot(Snapshot):
         mean: Mean of the standard inputs they were fitted on, (S,).
         std: Their standard deviation, (S,).
         lens: How the visual inputs were made; None if that is not known.
+        robot: Name of the robot.
     """
 
     def __init__(
         self, *, number: int, config: PredictorConfig, nets: Sequence[SimilarityNet], visual: np.ndarray,
-        mean: np.ndarray, std: np.ndarray, lens: Lens | None,
+        mean: np.ndarray, std: np.ndarray, lens: Lens | None, robot: str,
     ) -> None:  # fmt: skip
         super().__init__(number=number, config=config)
         self.nets = [net.eval().requires_grad_(False) for net in nets]
         self.mean, self.std = mean, std
-        self.lens = lens
+        self.lens, self._robot = lens, robot
         self._visual = visual
         self._device = nets[0].fuse_visual.weight.device
         seen = torch.from_numpy(visual).to(self._device)
@@ -120,7 +130,8 @@ class NetworkSnapshot(Snapshot):
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """As ``Snapshot.member_probabilities``."""
-        inputs = torch.from_numpy((standard_inputs(obs, actions) - self.mean) / self.std).to(self._device)
+        standard = standard_inputs(obs, actions, self._robot)
+        inputs = torch.from_numpy((standard - self.mean) / self.std).to(self._device)
         index = torch.from_numpy(np.ascontiguousarray(frames).astype(np.int64)).to(self._device)
         with torch.inference_mode():
             members = []
@@ -133,7 +144,7 @@ class NetworkSnapshot(Snapshot):
         """As ``Snapshot.beside``; the view is through this snapshot's lens."""
         return NetworkSnapshot(
             number=0, config=self.config, nets=self.nets, visual=view.visual, mean=self.mean, std=self.std,
-            lens=self.lens,
+            lens=self.lens, robot=self._robot,
         )  # fmt: skip
 
     def tensors(self) -> dict[str, Any]:
@@ -142,14 +153,18 @@ class NetworkSnapshot(Snapshot):
         if self.lens is not None:
             arrays |= {"lens_mean": self.lens.mean, "lens_axes": self.lens.axes}
         nets = [{name: x.cpu() for name, x in net.state_dict().items()} for net in self.nets]
-        return {"nets": nets, **{name: torch.from_numpy(array) for name, array in arrays.items()}}
+        return {
+            "nets": nets,
+            "robot": self._robot,
+            **{name: torch.from_numpy(array) for name, array in arrays.items()},
+        }
 
 
 def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> NetworkSnapshot:
     """The snapshot whose ``tensors`` are in ``data``."""
     nets = []
     for weights in data["nets"] if "nets" in data else [data["net"]]:
-        net = SimilarityNet(data["visual"].shape[1], config, torch.Generator())
+        net = SimilarityNet(data["visual"].shape[1], len(data["mean"]), config, torch.Generator())
         net.load_state_dict(weights)
         nets.append(net.to(device))
     lens = None
@@ -158,6 +173,7 @@ def restore(data: dict[str, Any], config: PredictorConfig, device: str) -> Netwo
     return NetworkSnapshot(
         number=data["number"], config=config, nets=nets, visual=data["visual"].numpy(),
         mean=data["mean"].numpy(), std=data["std"].numpy(), lens=lens,
+        robot=data.get("robot", "hopper"),
     )  # fmt: skip
 
 
@@ -174,7 +190,7 @@ def fit(
     generator = torch.Generator().manual_seed(seed)
     ratings, frames = split_marks(ratings, frames)
     obs, actions = (np.stack([getattr(r.segment, name) for r in ratings]) for name in ("obs", "actions"))
-    inputs = standard_inputs(obs, actions)
+    inputs = standard_inputs(obs, actions, view.robot)
     mean, std = inputs.mean(axis=(0, 1)), inputs.std(axis=(0, 1)) + 0.05
     if start is not None:
         mean, std = start.mean, start.std
@@ -185,7 +201,7 @@ def fit(
     classes_n = torch.tensor([r.value - 1 for r in ratings])
     nets, losses = [], []
     for member in range(config.members):
-        net = SimilarityNet(view.visual.shape[1], config, generator).to(device)
+        net = SimilarityNet(view.visual.shape[1], inputs.shape[-1], config, generator).to(device)
         if start is not None:
             _take_weights(net, start, member)
         rate = config.learning_rate * (1.0 if start is None else _TUNED)
@@ -194,7 +210,7 @@ def fit(
         losses.append(loss)
     snapshot = NetworkSnapshot(
         number=number, config=config, nets=nets, visual=view.visual, mean=mean, std=std,
-        lens=view.lens,
+        lens=view.lens, robot=view.robot,
     )  # fmt: skip
     some = slice(None, None, -(-len(ratings) // _JUDGED_CLIPS))
     chosen = snapshot.probabilities(frames[some], obs[some], actions[some]).mean(axis=1).argmax(axis=-1)
@@ -217,7 +233,7 @@ def _fit_one(
     classes_n: torch.Tensor, config: PredictorConfig, rate: float, generator: torch.Generator, device: str,
 ) -> float:  # fmt: skip
     """Trains one network; its mean loss over the last tenth of the updates."""
-    optimiser = torch.optim.SGD(
+    optimiser = optimisers.SGD(
         net.parameters(), lr=rate, momentum=0.9, weight_decay=config.weight_decay, fused=True
     )
     counts = torch.bincount(classes_n, minlength=CLASSES)

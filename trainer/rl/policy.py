@@ -164,10 +164,6 @@ class Policy(nn.Module):
         """Mean actions of normalised inputs, (B, f) to (B, a)."""
         return self.mean(inputs)
 
-    def log_prob(self, inputs: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
-        """Log density of actions (B, a) at inputs (B, f), in nats: (B,)."""
-        return self.log_prob_of(self(inputs), actions)
-
     def log_prob_of(self, mean: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """Log density of actions (B, a) around mean actions (B, a), in nats: (B,)."""
         z = (actions - mean) * torch.exp(-self.log_std)

@@ -4,7 +4,7 @@
 episode. ``EpisodeRules`` says how episodes start, how the demo phase moves, what a step is worth and
 when an episode ends early; the class itself is the plain case; subclass it for another.
 
-Shapes: N lanes, T control steps, o observations, a actions, q = v positions and velocities,
+Shapes: N lanes, T control steps, o observations, a actions, q positions, v velocities,
 f policy inputs, K lanes that restart.
 """
 

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
+from onedemo.core import optimisers
 from onedemo.rl.fisher import conjugate_gradient, fisher_product, mean_kl
 from onedemo.rl.policy import Policy, ValueFunction
 from onedemo.rl.settings import TrpoConfig
@@ -69,7 +70,7 @@ class Trpo:
         self.value = ValueFunction(policy.input_size, policy.config.hidden, seed=seed).to(policy.device)
         self._parameters = [*policy.mean.parameters(), policy.log_std]
         # Fused: one pass over the parameters; they are few, and the calls would cost more than the sums.
-        self._adam = torch.optim.Adam(self.value.parameters(), config.value_rate, fused=True)
+        self._adam = optimisers.Adam(self.value.parameters(), config.value_rate, fused=True)
         self._beside = ThreadPoolExecutor(1, "value", _one_thread) if threads > 1 else None
         self._generator = torch.Generator().manual_seed(seed)
 

@@ -19,6 +19,8 @@ _MARGIN = 1.12
 """Of a robot that stays where it is, the picture shows all that it can reach, and so much more."""
 _EYE_LEVEL = 0.83
 """Height of a camera that follows, in halves of the picture's height: some floor is seen below the robot."""
+_NEARER = 0.8
+"""Of half of its depth the camera goes back from a robot that has any."""
 _TRIES = 200
 """Random positions from which is learned how far a robot reaches."""
 
@@ -159,10 +161,13 @@ def chosen_camera(model: mujoco.MjModel, root: str) -> Camera:
         half = max(tall / _TALL, wide / _WIDE / _ASPECT) / 2
         height = _EYE_LEVEL * half if up == 2 else float(low[up] + high[up]) / 2
     half = max(float(half), 1e-3)
+    distance = half / math.tan(math.radians(FOVY / 2))
+    if root == "free":  # what reaches toward the camera looks larger
+        distance += _NEARER * float(high[along] - low[along]) / 2
     if up == 2:
         height = max(height, 0.1 * half)  # not below the floor
     return Camera(
-        right=right, up=up, distance=_three_digits(half / math.tan(math.radians(FOVY / 2))),
+        right=right, up=up, distance=_three_digits(distance),
         height=_three_digits(height), follows=root != "fixed",
         middle=_three_digits(float(low_of_all[right] + high_of_all[right]) / 2) if root == "fixed" else 0.0,
         depth=0.0 if root == "planar" else round(depth, 6), floor=round(floor, 6),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot
 
 
 def backflip_reward(next_obs: np.ndarray, actions: np.ndarray, *, clip_actions: bool = True) -> np.ndarray:
@@ -57,17 +58,18 @@ def hop_reward(
     return forward + upright - hopper.stock.control * np.square(actions).sum(-1)
 
 
-def until_fall(next_qpos: np.ndarray, next_qvel: np.ndarray) -> np.ndarray:
-    """Whether each step belongs to the stock Hopper-v5 episode, the step that falls included.
+def until_fall(next_qpos: np.ndarray, next_qvel: np.ndarray, of: Robot | None = None) -> np.ndarray:
+    """Whether each step belongs to gymnasium's episode, the step that falls included.
 
     Args:
         next_qpos: Positions after each step, (..., T, q).
         next_qvel: Velocities after each step, (..., T, v).
+        of: The robot; the hopper if not given.
 
     Returns:
         True up to the first fall, (..., T). The stock return is the sum of the rewards there.
     """
-    upright = robot_named("hopper").healthy(next_qpos, next_qvel)
+    upright = (of or robot_named("hopper")).healthy(next_qpos, next_qvel)
     before = np.concatenate([np.ones_like(upright[..., :1]), upright[..., :-1]], axis=-1)
     return np.logical_and.accumulate(before, axis=-1)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from onedemo.storage.database import Database, now
-from onedemo.storage.rating_records import LOOKED_BACK, AlreadyAnswered
+from onedemo.storage.rating_records import LOOKED_BACK, MOST_REASON, AlreadyAnswered
 from onedemo.storage.segment_codec import pack_segment, unpack_segment
 from onedemo.types import Segment
 
@@ -114,7 +114,9 @@ class Comparisons:
             raise KeyError(f"no pair {pair_id}")
         return unpack_segment(rows[0][0]), unpack_segment(rows[0][1])
 
-    def compare(self, pair_id: int, rater_id: int, answer: str, latency_ms: int) -> int:
+    def compare(
+        self, pair_id: int, rater_id: int, answer: str, latency_ms: int, *, reason: str | None = None
+    ) -> int:
         """Commits what a rater says of a pair and returns the event's number.
 
         Args:
@@ -122,6 +124,8 @@ class Comparisons:
             rater_id: Who says it.
             answer: One of ``ANSWERS``, "skip", or "undo": takes back what the rater said of it.
             latency_ms: From the pair on screen to the press.
+            reason: Of a skip, in the rater's words, 1 to ``MOST_REASON`` characters; it may be said of a skip
+                that holds and has none.
 
         Raises:
             AlreadyAnswered: If the rater's answer holds already.
@@ -129,23 +133,27 @@ class Comparisons:
         """
         if answer not in (*ANSWERS, "skip", "undo"):
             raise ValueError(f"a pair is {', '.join(ANSWERS)} or skipped, not {answer!r}")
+        if reason is not None and not (answer == "skip" and 0 < len(reason) <= MOST_REASON):
+            raise ValueError(f"a reason is of a skip and has 1 to {MOST_REASON} characters")
         with self._database.transaction() as db:
             rows = db.execute(
-                "SELECT (SELECT answer FROM comparisons WHERE pair_id = p.id AND rater_id = ?"
-                "  ORDER BY id DESC LIMIT 1) FROM pairs p WHERE p.id = ?",
+                "SELECT (SELECT answer || (reason IS NOT NULL) FROM comparisons"
+                "  WHERE pair_id = p.id AND rater_id = ? ORDER BY id DESC LIMIT 1)"
+                " FROM pairs p WHERE p.id = ?",
                 (rater_id, pair_id),
             ).fetchall()
             if not rows:
                 raise ValueError(f"no pair {pair_id}")
-            holds = rows[0][0] not in (None, "undo")
-            if holds and answer != "undo":
+            last = rows[0][0]
+            holds = last not in (None, "undo0")
+            if holds and answer != "undo" and not (reason is not None and last == "skip0"):
                 raise AlreadyAnswered(f"pair {pair_id} is answered already")
             if not holds and answer == "undo":
                 raise ValueError("nothing to take back")
             cursor = db.execute(
-                "INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
-                " VALUES (?, ?, ?, ?, ?)",
-                (pair_id, rater_id, answer, max(0, int(latency_ms)), now()),
+                "INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at, reason)"
+                " VALUES (?, ?, ?, ?, ?, ?)",
+                (pair_id, rater_id, answer, max(0, int(latency_ms)), now(), reason),
             )
             assert cursor.lastrowid is not None
             return cursor.lastrowid
@@ -180,8 +188,8 @@ class Comparisons:
     def stream_history(self, run: str | None = None) -> Iterator[tuple]:
         """What ``stream`` does not give, as ``Ratings.stream_history``: skips, undos, what was taken back."""
         return self._database.stream(
-            "SELECT c.id, NULL, c.pair_id, p.run, a.name, c.answer, NULL, 0, NULL, NULL, NULL, NULL, NULL,"
-            " c.latency_ms, c.created_at, NULL, NULL"
+            "SELECT c.id, NULL, c.pair_id, p.run, a.name, c.answer, NULL, 0, NULL, NULL, c.reason, NULL,"
+            " NULL, c.latency_ms, c.created_at, NULL, NULL"
             " FROM comparisons c JOIN pairs p ON p.id = c.pair_id JOIN raters a ON a.id = c.rater_id"
             " WHERE (?1 IS NULL OR p.run = ?1) AND (c.answer IN ('skip', 'undo') OR EXISTS ("
             "  SELECT 1 FROM comparisons l WHERE l.pair_id = c.pair_id AND l.rater_id = c.rater_id"
@@ -223,9 +231,9 @@ class Comparisons:
 
     def restore(self, row: Mapping[str, Any]) -> None:
         """Stores what was said of a pair as it was: a row of the table ``comparisons``."""
-        names = ("id", "pair_id", "rater_id", "answer", "latency_ms", "created_at")
+        names = ("id", "pair_id", "rater_id", "answer", "latency_ms", "created_at", "reason")
         with self._database.transaction() as db:
             db.execute(
                 f"INSERT INTO comparisons ({', '.join(names)}) VALUES (:{', :'.join(names)})",
-                {name: row[name] for name in names},
+                {name: row.get(name) for name in names},
             )

@@ -282,6 +282,10 @@ STEPS: dict[int, str] = {
     ALTER TABLE runs ADD COLUMN title TEXT NOT NULL DEFAULT '';
     ALTER TABLE runs ADD COLUMN note TEXT NOT NULL DEFAULT '';
     """,
+    # 10: why a pair was skipped, in the rater's words.
+    10: """
+    ALTER TABLE comparisons ADD COLUMN reason TEXT CHECK (reason IS NULL OR answer = 'skip');
+    """,
 }
 
 

@@ -313,7 +313,7 @@ class Learner:
             rng = np.random.default_rng([self.config.seed, snapshot.number])
             wild = self._wild_rollouts()
             self._buffer = fill_reset_buffer(
-                snapshot, wild, self.frames_of, self.demo_steps, rng, tries=practice.bank_tries
+                snapshot, wild, self.frames_of, self.demo_steps, rng, tries=practice.bank_tries, dt=self.dt
             )
             self._buffer_of = snapshot.number
         self._rules.use(snapshot, self._buffer)

@@ -114,6 +114,15 @@ def _leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def check_robot(demo: Demo, robot: str) -> None:
+    """Raises UserError if the demo is of another robot than the one that would learn from it, by name."""
+    if demo.robot and demo.robot != robot:
+        raise UserError(
+            f"demonstration {demo.name!r} shows robot {demo.robot!r}, but this run's robot is {robot!r}: "
+            f"choose a demonstration of {robot!r}, or robot {demo.robot!r}"
+        )
+
+
 def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name: str | None) -> str:
     """Records a new run and writes its settings; returns its name.
 
@@ -129,11 +138,7 @@ def add_run(store: Store, data_dir: Path, demo: Demo, config: RunConfig, *, name
             is taken or cannot be the name of a directory.
     """
     robot = robot_named(config.env)
-    if demo.robot not in ("", config.env):
-        raise UserError(
-            f"demo {demo.name} was made with robot {demo.robot}, and {config.env} cannot do the same: leave "
-            f"--robot out, or choose a demo of {config.env} or a video of something else"
-        )
+    check_robot(demo, robot.name)
     if config.env_sha256 not in ("", robot.sha256):
         raise UserError(
             f"these settings are of a run with another model of robot {config.env} than there is now; leave "

@@ -65,7 +65,9 @@ def train(
     hidden = load_hidden(hidden_file) if hidden_file.exists() else None
     given = sum(store.ratings.by_class(name)) if name else 0
     budget = config.ratings.pretrain + config.ratings.online
-    simulated = make_rater(rater, hidden, demo=demo, budget=budget, given=given, seed=config.seed)
+    simulated = make_rater(
+        rater, hidden, demo=demo, budget=budget, given=given, seed=config.seed, robot=config.env
+    )
     found = find_run(store, data_dir, demo, name=name, wanted=config) if name else None
     run = found[0] if found else add_run(store, data_dir, demo, config, name=name)
     training = TrainingRun(
@@ -83,7 +85,7 @@ def train(
     practised = time.monotonic() - began
     learner, snapshot = training.learner, training.snapshot
     assert learner is not None
-    oracle = Oracle(hidden, budget=0) if hidden is not None else None
+    oracle = Oracle(hidden, config.env, budget=0) if hidden is not None else None
     by_class = store.ratings.by_class(run)
     return {
         "run": run,

@@ -41,9 +41,11 @@ from onedemo.training.learner import Learner
 from onedemo.training.pictures import PictureFiles, tidy
 from onedemo.training.rating_queue import RatingQueue, Simulated
 from onedemo.types import Clip, Demo, Rollouts
+from onedemo.vision import silhouette
 from onedemo.vision.encoders import Encoder, demo_features
-from onedemo.vision.pose_estimator import PoseEstimator, Track
-from onedemo.vision.pose_estimator import learn as learn_pose_estimator
+from onedemo.vision.mask_file import masks_of
+from onedemo.vision.pose_estimator import Track, shipped_track
+from onedemo.vision.silhouette import Silhouette
 
 _TIDY_S = 10.0
 """Between two looks at what pictures can be deleted."""
@@ -78,7 +80,7 @@ class TrainingRun:
         watch: Called after each iteration.
         start: Snapshot of another run that this one's predictor starts from; a copy is kept, so a resumed
             run needs none.
-        learn_robot: Learns what the robot looks like, as ``onedemo.vision.pose_estimator.learn``.
+        learn_robot: Learns what the robot looks like, as ``onedemo.vision.silhouette.learn``.
     """
 
     def __init__(
@@ -95,7 +97,7 @@ class TrainingRun:
         cache_dir: Path | None = None,
         watch: Callable[[Learner, Snapshot], None] | None = None,
         start: Path | None = None,
-        learn_robot: Callable[..., PoseEstimator] = learn_pose_estimator,
+        learn_robot: Callable[..., Silhouette] = silhouette.learn,
     ) -> None:
         self.store, self.run, self.demo, self.config = store, run, demo, config
         self.data_dir = data_dir
@@ -170,7 +172,9 @@ class TrainingRun:
             self._drawn.clips.recover(self.run)
 
     def look(self, check: Callable[[], None] = lambda: None) -> tuple[np.ndarray, Track | None]:
-        """Looks at the demo, and at the robot if asked for: a minute or more the first time.
+        """Looks at the demo, and reads the robot's pose in it if asked for.
+
+        That takes seconds for a robot that comes with the program, and minutes the first time for another.
 
         Another thread than the one that asks may do it.
 
@@ -185,6 +189,8 @@ class TrainingRun:
         features = demo_features(self.demo, self._encoder, self._cache_dir / "demos")
         if not self.config.predictor.appearance:
             return features, None
+        if (track := shipped_track(self.demo)) is not None:
+            return features, track
         began = time.monotonic()
 
         def note(share: float = 0.0) -> None:  # never called if it was learned before
@@ -193,10 +199,11 @@ class TrainingRun:
             check()
 
         try:
-            look = self._learn_robot(self.config.env, self._encoder, self._cache_dir / "robots", note)
+            shapes = self._learn_robot(self.config.env, self._cache_dir / "robots", note)
         finally:
             self._learning = None
-        return features, look.track(features, self.demo.fps) if look.knows(features) else None
+        self.preparing = "The robot is looked for in the demonstration video."
+        return features, shapes.track(masks_of(self.demo, shapes.reach), self.demo.fps)
 
     def looking(self) -> tuple[float | None, float | None]:
         """How much of learning what the robot looks like is done, 0 to 1, and seconds left; None: not known.

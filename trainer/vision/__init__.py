@@ -1,5 +1,5 @@
 """What a demo's frames show: features of frozen networks (``encoders``), and the robot's pose in them.
 
-``pose_estimator`` learns the pose from pictures of the robot's own random states, once for robot and
-encoder. Neither sees a rating or a demo's hidden states.
+``masks`` finds the robot, and ``silhouette`` reads its pose from the shape, learned from pictures of the
+robot's own random states, once for a robot. Neither sees a rating or a demo's hidden states.
 """

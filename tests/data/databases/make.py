@@ -70,6 +70,9 @@ def make(version: int, file: Path) -> None:
             (pack_segment(segment(7)), pack_segment(segment(8)), AT))  # fmt: skip
         put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at)"
             " VALUES (1, 2, 'left', 600, ?)", (AT,))  # fmt: skip
+        if version >= 10:
+            put("INSERT INTO comparisons (pair_id, rater_id, answer, latency_ms, created_at, reason)"
+                " VALUES (1, 1, 'skip', 500, ?, 'too dark')", (AT,))  # fmt: skip
         put("UPDATE tokens SET once = 1, expires_at = ? WHERE hash = ?", ("2099" + AT[4:], "a" * 64))
         if version >= 9:
             put("UPDATE runs SET title = 'With marks', note = 'Bo left at half.'")

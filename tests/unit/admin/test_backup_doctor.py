@@ -31,7 +31,7 @@ from onedemo.app.admin.restore import restore
 from onedemo.app.cli.main import main
 from onedemo.app.http.tokens import read_secret
 from onedemo.core.files import archive_fault, jpeg_fault, read_whole, sealed
-from onedemo.demos.library import import_video
+from onedemo.demos.library import find_demo, import_video
 from onedemo.demos.sandboxed_decoder import Limits, decode
 from onedemo.errors import UserError
 from onedemo.render.clip_image import compose_clip
@@ -63,7 +63,7 @@ def made(tmp_path_factory, demo):
     about = asdict(demo) | {"path": "", "video_sha256": digest}
     (home / "demo.json").write_text(json.dumps(about))
     video = make_video(tmp_path_factory.mktemp("video") / "mine.mp4")
-    import_video(video, name="mine", demos_dir=directory / "demos")
+    import_video(video, name="mine", demos_dir=directory / "demos", reverse=True)
     read_secret(directory)
     return directory
 
@@ -92,6 +92,7 @@ def test_a_backup_gives_the_same_directory_again(data_dir, tmp_path, demo):
     counts = back_up(data_dir, tmp_path / "all.zip")
     assert stat.S_IMODE((tmp_path / "all.zip").stat().st_mode) == 0o600
     restore(tmp_path / "all.zip", tmp_path / "again")
+    assert find_demo("mine", tmp_path / "again" / "demos").edits == "backwards"
     assert tables(tmp_path / "again") == tables(data_dir)
     assert files(tmp_path / "again") == files(data_dir) and len(files(data_dir)) == counts.files - 1
     assert stat.S_IMODE((tmp_path / "again" / "link-secret").stat().st_mode) == 0o600

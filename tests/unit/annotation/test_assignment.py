@@ -292,6 +292,30 @@ def test_a_shared_clip_is_rated_by_the_second_person_too_and_both_count(store, c
     assert cy.current is None  # bo holds the other two, and nothing else is shared
 
 
+def test_shared_clips_do_not_lead_beyond_what_was_asked_for(store, clock):
+    target, queue, assignment = 24, 4, Assignment()
+
+    def wanted():
+        return target - store.ratings.count_for_training("r")
+
+    people = [
+        make_desk(store, clock, name, assignment, rng=Always("shared"), wanted=wanted)
+        for name in ("ann", "bo", "cy")
+    ]
+    for _ in range(target):  # each time as the trainer does it: what waits and what is there are the target
+        if (missing := min(queue, wanted()) - len(store.clips.waiting("r"))) > 0:
+            add_clips(store, missing)
+        clock.now += 1
+        for person in people:
+            person.refill()
+            clock.now += 1
+            if person.current is not None:
+                assert person.rate(person.current, 3)
+    assert store.ratings.count_for_training("r") == target
+    assert len({row[1] for row in store.ratings.stream()}) < target  # and some were shared
+    assert all(person.current is None for person in people)
+
+
 def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
     add_clips(store, REPEAT_AFTER + 3)
     rng = Always("fresh")

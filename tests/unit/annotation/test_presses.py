@@ -14,6 +14,7 @@ from onedemo.app.annotation.tutorial import Lesson
 PAGE = {"page": "p", "id": "1"}
 RATE = PAGE | {"press": "rate", "clip": 7, "value": 3}
 REASON = PAGE | {"press": "reason", "clip": 7, "reason": "too dark"}
+PAIR_REASON = PAGE | {"press": "pair reason", "pair": 7, "reason": "too dark"}
 PRACTISE = PAGE | {"press": "practise", "exercise": 0, "do": 4}
 
 
@@ -25,6 +26,7 @@ def test_every_kind_of_press_is_read():
     assert read(RATE | {"mark": [0, 3]}) == presses.Rate(page="p", id="1", clip=7, value=3, mark=(0, 3))
     assert read(RATE | {"mark": None}) == presses.Rate(page="p", id="1", clip=7, value=3)
     assert read(REASON) == presses.Explain(page="p", id="1", clip=7, reason="too dark")
+    assert read(PAIR_REASON) == presses.ExplainPair(page="p", id="1", pair=7, reason="too dark")
     assert read(PRACTISE).do == 4 and read(PRACTISE | {"do": "next"}).do == "next"
     for kind in ("skip", "undo"):
         assert read(PAGE | {"press": kind, "clip": 7}).clip == 7
@@ -43,7 +45,7 @@ def test_every_kind_of_press_is_read():
         {key: value for key, value in RATE.items() if key != "page"},
         REASON | {"reason": 7}, REASON | {"reason": " "}, REASON | {"reason": "a\nb"},
         REASON | {"reason": "x" * 201}, PRACTISE | {"do": "x"}, PRACTISE | {"exercise": -1},
-        PAGE | {"press": "compare", "pair": 7, "answer": "both"},
+        PAGE | {"press": "compare", "pair": 7, "answer": "both"}, PAIR_REASON | {"reason": "a\nb"},
     ],
 )  # fmt: skip
 def test_anything_else_is_refused(body):

@@ -23,7 +23,7 @@ class Ruler(DistanceAnnotator):
 
 def ruler(*parts, budget=N, **more):
     errors, seed = parse_errors(parts, "ruler")
-    return Ruler(THRESHOLDS, budget=budget, errors=errors, seed=seed or 0, **more)
+    return Ruler(THRESHOLDS, dt=0.008, budget=budget, errors=errors, seed=seed or 0, **more)
 
 
 def clip(distance, steps=10):

@@ -10,6 +10,7 @@ import torch
 from helpers.paths import DEMOS
 from onedemo.baselines import handcoded_trpo, make_demo, trajectory_search
 from onedemo.demos.ground_truth import HiddenStates, hidden_path, load_hidden, save_hidden
+from onedemo.demos.library import find_demo
 from onedemo.errors import UserError
 from onedemo.evaluation.metrics import clean_turns, net_turns
 from onedemo.rl.policy import Policy, PolicyConfig
@@ -186,3 +187,13 @@ def test_shipped_demos(name):
     else:
         assert until_fall(hidden.qpos[1:], hidden.qvel[1:]).all()
         assert hidden.qpos[-1, 0] > 8, "a lively hop goes forward"
+
+
+@pytest.mark.parametrize("name, travel", [("walker2d-hop", 12), ("half-cheetah-run", 20)])
+def test_shipped_demos_of_other_robots(name, travel):
+    demo, hidden = find_demo(name, DEMOS), load_hidden(DEMOS / f"{name}.hidden.npz")
+    robot = robot_named(demo.robot)
+    assert 4 <= demo.seconds <= 8.1 and (DEMOS / f"{name}.webm").stat().st_size < 1 << 20
+    np.testing.assert_allclose(hidden.obs, robot.observe(hidden.qpos, hidden.qvel))
+    assert until_fall(hidden.qpos[1:], hidden.qvel[1:], robot).all()
+    assert hidden.qpos[-1, 0] > travel, "metres"

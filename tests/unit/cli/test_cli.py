@@ -11,8 +11,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from helpers import warm
 from helpers.paths import ROOT
 from helpers.server_process import Serving
+from load import serving as real
 from load.serving import FEW_STATES
 from onedemo.app.cli.main import _app, main
 from onedemo.config import METHODS, RunConfig, describe, to_toml
@@ -238,7 +240,9 @@ def test_serve_prints_both_links_refuses_a_taken_port_and_ends_on_sigterm(servin
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    serving.begin = real.command  # as a person starts it, this once
     child, links, _ = serving.start("--port", str(port), *FEW)
+    serving.begin = warm.begin
     assert list(links) == ["researcher", "annotator"]
     assert all(link.startswith(f"http://127.0.0.1:{port}/login?token=") for link in links.values())
     second, none, log = serving.start("--port", str(port))

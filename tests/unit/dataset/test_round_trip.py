@@ -85,6 +85,7 @@ def study(tmp_path_factory):
         say(pairs[0], ann, "left", 50)
         say(pairs[0], bob, "equal", 60)
         say(pairs[1], ann, "skip", 70)
+        say(pairs[1], ann, "skip", 0, reason="=too short")
         say(pairs[2], ann, "right", 80)
         say(pairs[2], ann, "undo", 0)
         say(pairs[2], ann, "left", 90)
@@ -98,7 +99,7 @@ def test_everything_comes_back(study, tmp_path, capsys):
     assert sorted(path.name for path in export.iterdir()) == sorted(FILES)
     again = tmp_path / "again"
     assert main(["import", str(export), "--data-dir", str(again)]) == 0
-    assert capsys.readouterr().out == "2 runs  6 clips  5 ratings  4 comparisons  22 events\n"
+    assert capsys.readouterr().out == "2 runs  6 clips  5 ratings  4 comparisons  23 events\n"
     with closing(Store(data_dir)) as before, closing(Store(again)) as after:
         for query in (EVENTS, ANSWERS):
             one, other = (by_name(store, query) for store in (before, after))
@@ -388,7 +389,8 @@ def test_a_full_disk_is_a_sentence_and_leaves_no_half_file(study, tmp_path, opti
 @pytest.mark.seam
 def test_a_demo_of_that_name_with_other_frames_is_named_before_anything_is_imported(tmp_path, capsys):
     there, here = tmp_path / "there", tmp_path / "here"
-    rated = import_video(make_video(tmp_path / "a.avi", count=20), name="kick", demos_dir=there / "demos")
+    video = make_video(tmp_path / "a.avi", count=40)
+    rated = import_video(video, name="kick", demos_dir=there / "demos", speed=2.0, reverse=True)
     import_video(make_video(tmp_path / "b.avi", count=15), name="kick", demos_dir=here / "demos")
     config = to_toml(load_config(None, {}))
     with closing(Store(there)) as store:
@@ -397,7 +399,10 @@ def test_a_demo_of_that_name_with_other_frames_is_named_before_anything_is_impor
     assert main(["export", "--data-dir", str(there), "--all", str(tmp_path / "all")]) == 0
     assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 2
     said = capsys.readouterr().err
-    assert "run r-1 was rated beside a demo kick of 20 frames" in said and "has 15 and other pictures" in said
+    assert "rated beside a demo kick of 20 frames (2 times as fast, backwards), and the one" in said
+    assert "has 15 and other pictures" in said
+    card_text = (tmp_path / "all" / "card.md").read_text()
+    assert "What was done to the video of the demonstration: 2 times as fast, backwards." in card_text
     assert not (here / "runs").exists()
     assert main(["demo", "rename", "kick", "kick-other", "--data-dir", str(here)]) == 0
     assert main(["import", str(tmp_path / "all"), "--data-dir", str(here)]) == 0

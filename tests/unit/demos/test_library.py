@@ -15,6 +15,7 @@ from PIL import Image
 
 from helpers.paths import PERSON, ROOT
 from onedemo.demos import library as demos
+from onedemo.demos import preparing
 from onedemo.demos.decoder_child import shaped_frames
 from onedemo.demos.library import find_demo, import_video, list_demos, read_frames, render_demo, show
 from onedemo.demos.resampling import resample
@@ -67,7 +68,9 @@ def make_video(path, count=30, fps=30.0, size=(WIDTH, HEIGHT), picture=numbered)
 def quickly(request, monkeypatch):
     """Decodes in this process, but for tests that are marked ``seam``: the child has tests of its own."""
     if request.node.get_closest_marker("seam") is None:
-        monkeypatch.setattr(demos, "decode", lambda path, options, _, warn: in_process(path, options, warn))
+        monkeypatch.setattr(
+            preparing, "decode", lambda path, options, _, warn: in_process(path, options, warn)
+        )
 
 
 def in_process(path, options, warn):
@@ -353,7 +356,7 @@ def test_the_built_in_demos_are_whole():
         assert demo.path == path and path.stem == demo.name
         assert read_frames(demo).shape == (240, 360, 480, 3)
         assert demo.task in ("backflip", "hop")
-        assert demos._sha256(path) == demo.sha256
+        assert preparing.sha256_of(path) == demo.sha256
 
 
 @pytest.mark.seam
@@ -472,7 +475,7 @@ def test_rename_and_remove(video, library, tmp_path):
 
 def test_what_was_stored_is_compared_with_what_came_in(video, library, monkeypatch):
     """As if the encoder stored black, as OpenCV decoded interlaced video."""
-    monkeypatch.setattr(demos, "write_webm", lambda path, frames, fps: write_webm(
+    monkeypatch.setattr(preparing, "write_webm", lambda path, frames, fps: write_webm(
         path, (frame * (number < 20) for number, frame in enumerate(frames)), fps=fps))  # fmt: skip
     assert "frame 20 was not stored as it came in" in refused(video, library)
 
@@ -512,7 +515,7 @@ def test_what_is_no_file_is_named(library, given, words):
     ],
 )
 def test_what_is_no_video_is_named_before_anything_is_decoded(tmp_path, library, monkeypatch, content, words):
-    monkeypatch.setattr(demos, "decode", None)
+    monkeypatch.setattr(preparing, "decode", None)
     (tmp_path / "x.mp4").write_bytes(content)
     assert re.search(words, refused(tmp_path / "x.mp4", library))
     with pytest.raises(UserError, match="is a folder: give one video file"):

@@ -15,10 +15,12 @@ import pytest
 
 from onedemo.demos import sandboxed_decoder
 from onedemo.demos.decoder_child import shaped_frames
+from onedemo.demos.edits import Options
 from onedemo.demos.library import import_video
-from onedemo.demos.sandboxed_decoder import Limits, Options, decode, look
+from onedemo.demos.sandboxed_decoder import Limits, decode, look
 from onedemo.demos.source import THREADS
 from onedemo.errors import UserError
+from unit.demos.test_edits import film, room_with, shaken, walk
 from unit.demos.test_library import make_video, number_of, refused
 
 pytestmark = pytest.mark.seam
@@ -289,3 +291,14 @@ def test_warnings_come_through_the_pipe(tmp_path):
         "it has 10 frames a second; fast moves can be seen better with 24 or more",
         "the picture is only 160 x 96 pixels; details will be hard to see",
     ]
+
+
+def test_what_is_held_still_and_followed_is_found_by_the_child_that_opens_no_file(tmp_path):
+    """All that this needs, MuJoCo with it, is loaded before the file is looked at."""
+    path = film(tmp_path / "walk.mp4", shaken([room_with(place) for place in walk(30)]))
+    options = Options(track=True, stabilise=True, reverse=True, speed=2.0, loop=2)
+    frames = list(decode(path, options, SMALL))
+    assert len(frames) == 30 and frames[0].shape[1] < 200
+    with path.open("rb") as file:
+        here = list(shaped_frames(file, "walk.mp4", options))
+    assert all((a == b).all() for a, b in zip(frames, here, strict=True))

@@ -25,7 +25,8 @@ from data.videos import KINDS, wrong
 from onedemo.demos import decoder_child
 from onedemo.demos.containers import check_file
 from onedemo.demos.import_checks import StoredCheck
-from onedemo.demos.sandboxed_decoder import Limits, Options
+from onedemo.demos.edits import Options
+from onedemo.demos.sandboxed_decoder import Limits
 from onedemo.errors import UserError
 
 av.logging.set_level(None)

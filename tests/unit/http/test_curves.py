@@ -6,6 +6,7 @@ import json
 import tomllib
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from aiohttp import CookieJar
 from aiohttp.test_utils import TestClient, TestServer
@@ -16,6 +17,11 @@ from helpers.paths import ROOT
 from onedemo.app.http.server import Front
 from onedemo.app.http.tokens import issue_link, read_secret
 from onedemo.app.network.bind import Listening
+from onedemo.demos.library import find_demo
+from onedemo.evaluation.demo_level import true_reward_of
+from onedemo.reward.model import PredictorConfig, View, fit
+from onedemo.storage.run_directory import RunDirectory
+from unit.reward.test_model import world
 
 
 @pytest.fixture
@@ -60,6 +66,33 @@ def test_any_run_is_told_of_with_its_own_colour(trainer):
     here, there, later = map(json.loads, (here, there, later))
     assert (here["colour"], here["live"], there["colour"], there["live"]) == (1, True, 2, False)
     assert there["columns"]["number"] == [1, 2, 3, 4] and later["columns"]["number"] == [4]
+
+
+def test_levels_of_the_demo_are_told_of_any_run_and_of_the_papers_predictor(trainer):
+    """That one has no best rating of its own: it is asked about the states behind the video."""
+    store, demo = trainer.store, find_demo("hopper-backflip", trainer.data_dir / "demos")
+    for run in ("hop-1", "paper-1"):
+        store.runs.add(run=run, demo=demo.name, demo_sha256=demo.sha256, seed=1, config="", version="0")
+    store.runs.describe("hop-1", title="By three raters", note="")
+    train(store, "hop-1", 1, 2)
+    store.runs.add_iteration("paper-1", 1, snapshot=1, env_steps=16_000, stats={"predicted": 2.0})
+    ratings, shown = world(20, seed=0)
+    view = View(
+        visual=np.zeros((demo.frames, 8), np.float32), track=None,
+        basis=np.ones((demo.frames, 1), np.float32), fps=demo.fps,
+    )  # fmt: skip
+    net = PredictorConfig(kind="network", appearance=False, members=1, updates=5, visual_dims=8)
+    fit(ratings, shown, view, net, number=1, seed=0)[0].save(
+        RunDirectory(trainer.data_dir, "paper-1").snapshot(1)
+    )
+    answers = ask(
+        trainer, "/curves.json?run=hop-1", "/curves.json?run=paper-1", "/curves.json?run=paper-1&after=1"
+    )
+    hop, paper, later = (json.loads(text) for _, text in answers)
+    assert (hop["title"], paper["title"]) == ("By three raters", "")
+    assert hop["levels"] == {"true_reward": pytest.approx(true_reward_of(demo))}
+    assert hop["levels"]["true_reward"] == paper["levels"]["true_reward"]
+    assert 1 < paper["levels"]["reference"] < 5 and later["levels"] == paper["levels"]
 
 
 def test_what_is_asked_wrongly_is_said(trainer):

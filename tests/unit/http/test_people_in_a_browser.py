@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import re
 import sqlite3
 import time
@@ -79,7 +80,10 @@ class Browser:
             method, address, headers=headers, allow_redirects=follow, json=body or {"do": "pause run"}
         ) as answer:
             return SimpleNamespace(
-                status=answer.status, headers=answer.headers, text=await answer.text(), at=answer.url.path_qs
+                status=answer.status,
+                headers=answer.headers,
+                text=await answer.text(errors="replace"),
+                at=answer.url.path_qs,
             )
 
     async def post(self, path, page="open", **headers):
@@ -308,6 +312,41 @@ def test_a_link_that_opened_once_leads_back_to_the_page_it_opened(store):
     run(go())
 
 
+def test_the_button_may_be_pressed_again_if_its_answer_was_lost(store):
+    """Before, the link was used up and its owner stood outside."""
+    ann = store.accounts.ensure("ann", "annotator")
+
+    async def lost(door, one, link):
+        """Presses the button, and the answer never comes: the browser keeps no cookie of it."""
+        page = await one.get(link)
+        assert page.status == 200 and "works only once" in page.text
+        before = {cookie.key: cookie.value for cookie in one.session.cookie_jar}
+        assert await press_the_button(door, one, link[-43:]) == 303
+        for cookie in list(one.session.cookie_jar):
+            if before.get(cookie.key) != cookie.value:
+                one.session.cookie_jar.clear(lambda morsel, key=cookie.key: morsel.key == key)
+
+    async def go():
+        async with front(store) as door, browser(door) as one, browser(door) as another:
+            first, second = (passing_link(store, ann, door.url, once=True) for _ in range(2))
+            await lost(door, one, first)
+            assert (await one.get("/r/1/session")).status == 401
+            assert await press_the_button(door, one, first[-43:]) == 303
+            assert (await one.get("/r/1/session")).status == 204
+            await lost(door, one, second)  # and by the link itself
+            assert (await one.get(second, follow=True)).at == "/r/1/"
+            assert (await one.get("/r/1/session")).status == 204
+            # The number alone opens nothing, nor does the link in another browser, nor after signing out.
+            assert await press_the_button(door, another, first[-43:]) == 403
+            await another.get(passing_link(store, ann, door.url, once=True))
+            assert await press_the_button(door, another, first[-43:]) == 403
+            assert (await one.post("/r/1/signout")).status == 303
+            assert await press_the_button(door, one, second[-43:]) == 403
+
+    run(go())
+    assert sum(presence.browsers for presence in store.accounts.presence().values()) == 1
+
+
 async def press_the_button(door, one, token):
     """Opens a link that opens once; the status of the answer."""
     async with one.session.post(
@@ -423,7 +462,7 @@ def test_sessions_of_a_link_are_bounded_and_those_in_use_stay(store):
 
 def parameters_of_the_client():
     """Every name by which Viser's client may ask its query for something, and some more."""
-    _, client = assets.viser_scripts()
+    client = gzip.decompress(assets.viser_files()["viser.js"].body).decode()
     assert "URLSearchParams" in client
     names = set(re.findall(r"\.(?:get|getAll|has)\(`([A-Za-z_]\w{2,40})`\)", client))
     variables = set(re.findall(r"\.(?:get|getAll|has)\((\w{1,5})\)", client))
@@ -447,12 +486,31 @@ def test_no_parameter_reaches_viser_s_client(store):
             page = await one.get("/r/1/?playbackPath=data:,x", follow=True)
             assert (page.status, page.at) == (200, "/r/1/")
             for path in ("/", "/login", "/signed-out"):  # no other address gives the client
-                assert "data-p=" not in (await one.get(path + "?playbackPath=x", follow=path != "/")).text
+                assert "viser.js" not in (await one.get(path + "?playbackPath=x", follow=path != "/")).text
 
     run(go())
 
 
-def test_nothing_inline_runs_but_viser_s_two_scripts(store):
+def test_viser_s_client_comes_as_files_that_a_browser_keeps(store):
+    async def go():
+        async with front(store) as door, browser(door) as one:
+            await one.get(link_of(store, door.url, "ann"))
+            page = await one.get("/r/1/")
+            names = re.findall(r'"(static/viser/[^"]+)"', page.text)
+            wasm = names[-1].replace("viser.js", "zstd.wasm")
+            return page, [await one.get(f"/r/1/{name}") for name in (*names, wasm, "static/viser/x.js")]
+
+    page, (style, script, wasm, other) = run(go())
+    assert len(page.text) < 4000 and other.status == 404
+    assert style.headers["Content-Type"] == "text/css" and ".mantine-" in style.text
+    assert script.headers["Content-Type"] == "text/javascript" and len(script.text) > 2_000_000
+    assert wasm.headers["Content-Type"] == "application/wasm"  # else it is not compiled as it comes
+    for file in (style, script, wasm):
+        assert "immutable" in file.headers["Cache-Control"]
+        assert int(file.headers["Content-Length"]) < 800_000  # what is packed is sent packed
+
+
+def test_nothing_inline_runs(store):
     async def go():
         async with front(store) as door, browser(door) as one:
             await one.get(link_of(store, door.url, "ann"))
@@ -465,9 +523,9 @@ def test_nothing_inline_runs_but_viser_s_two_scripts(store):
     assert policy["default-src"] == policy["frame-ancestors"] == "'none'"
     for kind in ("script", "connect", "img", "media", "font", "worker", "style"):
         assert not re.search(r"https?:|wss?:|\*", policy[f"{kind}-src"])
-    inline = [body for body in re.findall(r"<script[^>]*>(.*?)</script>", page.text, re.DOTALL) if body]
-    assert inline == [assets.viser_scripts()[0]]
-    assert policy["script-src"].count("'sha256-") == 2
+    assert policy["script-src"] == "'self' 'wasm-unsafe-eval'"
+    scripts = re.findall(r"<script([^>]*)>(.*?)</script>", page.text, re.DOTALL)
+    assert len(scripts) > 10 and all(' src="static/' in tag and not body for tag, body in scripts)
     for answer in others:
         assert answer.headers["Content-Security-Policy"] == assets.POLICY
     assert "script-src 's" not in assets.POLICY
@@ -480,7 +538,7 @@ def test_what_changes_something_is_done_from_an_open_page_alone(store):
         async with front(store) as door, browser(door) as one:
             await one.get(link_of(store, door.url, "ada", "researcher"))
             paths = [route.path for route in door.routes() if route.method == "POST"]
-            assert len(paths) == 12
+            assert len(paths) == 14
             for path in paths:
                 path = path.replace(r"{rater:\d{1,9}}", "1").replace("{upload:[0-9a-f]{32}}", "a" * 32)
                 refused = [
@@ -510,7 +568,7 @@ def test_a_tab_has_an_address(store):
             await ada.get(link_of(store, door.url, "ada", "researcher"))
             await bob.get(link_of(store, door.url, "bob"))
             page = await ada.get("/r/1/data")
-            assert page.status == 200 and "data-p=" in page.text
+            assert page.status == 200 and "viser.js" in page.text
             for query in ("?playbackPath=data:,x", "?"):
                 answer = await ada.get(f"/r/1/data{query}")
                 assert query == "?" or (answer.status, answer.headers["Location"]) == (303, "/r/1/data")

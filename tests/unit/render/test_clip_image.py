@@ -132,7 +132,7 @@ def test_a_clip_of_the_studio_is_small_and_quick():
         return np.stack([backdrop(480, 360, c, limb) for c, limb in zip(cameras, limbs, strict=True)])
 
     demo, agent = drive(2.0), drive(-1.0)
-    begin = time.perf_counter()
+    begin = time.process_time()  # of the processor: others may want it, too
     data = compose_clip(demo, agent)
-    assert time.perf_counter() - begin < 1.0  # 0.03 s on an idle core
+    assert time.process_time() - begin < 1.0  # it takes 0.03
     assert len(data) < 200_000

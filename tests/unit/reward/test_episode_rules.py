@@ -243,7 +243,7 @@ def states():
 
 def make_buffer(states, seed=0, demo_steps=DEMO_STEPS):
     rng = np.random.default_rng(seed)
-    return fill_reset_buffer(Places(), states, lambda steps: steps, demo_steps, rng, tries=8000)
+    return fill_reset_buffer(Places(), states, lambda steps: steps, demo_steps, rng, tries=8000, dt=0.008)
 
 
 def test_the_reset_buffer_holds_the_states_most_like_each_part_of_the_demo(states):

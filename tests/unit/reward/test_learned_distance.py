@@ -186,10 +186,11 @@ def test_probabilities_are_an_ordered_logit_of_the_distance(fitted, view):
     assert chances.min() >= 0
     track = np.concatenate([view.track.pose, view.track.motion], axis=-1)
     difference = track[frames] - np.concatenate([BODY.pose(obs), BODY.motion(obs)], axis=-1)
-    numbers = {name: x.numpy() for name, x in snapshot.tensors().items() if name != "robot"}
+    numbers = {name: x.numpy() for name, x in snapshot.tensors().items() if isinstance(x, torch.Tensor)}
     for member in range(3):
         weights = np.exp(numbers["log_weights"][member])
         distance = np.sqrt(np.square(difference) @ weights + 1e-4).ravel()
+        distance -= 0.5 * numbers["effort"][member]  # motors at rest, beside half of what they could do
         at_least = chances[member, ..., ::-1].cumsum(axis=-1)[..., :4].reshape(-1, 4)  # P(y >= 5), ... (2)
         steepness, thresholds = numbers["steepness"][member], numbers["thresholds"][member]
         formula = 1 / (1 + np.exp(-steepness * (thresholds - distance[:, None])))
@@ -211,10 +212,10 @@ def test_the_demos_own_states_are_rated_best(fitted, rollouts):
     assert others.mean() < 3.5
 
 
-def test_what_the_motors_do_does_not_matter_and_turns_do_not_count(fitted, rollouts):
+def test_what_the_motors_do_hardly_matters_to_this_rater_and_turns_do_not_count(fitted, rollouts):
     snapshot, frames, obs = fitted[0], np.arange(20), rollouts.obs[3, :20]
     expected = snapshot.ratings(frames, obs, np.zeros((20, 3)))
-    np.testing.assert_array_equal(snapshot.ratings(frames, obs, np.ones((20, 3))), expected)
+    assert np.abs(snapshot.ratings(frames, obs, np.ones((20, 3))) - expected).max() < 0.5
     turned = obs - 4 * np.pi * np.eye(11)[1]
     np.testing.assert_allclose(snapshot.ratings(frames, turned, np.zeros((20, 3))), expected, atol=1e-5)
 

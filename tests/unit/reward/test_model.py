@@ -69,7 +69,7 @@ def test_visual_inputs_keep_distances_and_do_not_depend_on_the_svds_signs():
 
 
 def test_the_sum_of_two_maps_is_the_papers_concatenation(visual):
-    net = SimilarityNet(8, paper(), torch.Generator().manual_seed(0))
+    net = SimilarityNet(8, 15, paper(), torch.Generator().manual_seed(0))
     v, s = torch.randn(7, 8), torch.randn(7, 15)
     weight = torch.cat([net.fuse_visual.weight, net.fuse_standard.weight], dim=1)
     joined = torch.cat([v, net.standard(s)], dim=1) @ weight.T + net.fuse_standard.bias
@@ -77,11 +77,11 @@ def test_the_sum_of_two_maps_is_the_papers_concatenation(visual):
 
 
 def test_the_network_is_the_papers():
-    net = SimilarityNet(8, paper(), torch.Generator())
+    net = SimilarityNet(8, 15, paper(), torch.Generator())
     kinds = [type(m).__name__ for m in net.standard]
     assert kinds == ["Linear", "ReLU", "Linear", "ReLU"]
     assert [type(m).__name__ for m in net.head] == ["ReLU", "Linear", "ReLU", "Linear"]
-    plain = SimilarityNet(8, paper(additional_layer=False), torch.Generator())
+    plain = SimilarityNet(8, 15, paper(additional_layer=False), torch.Generator())
     assert [type(m).__name__ for m in plain.head] == ["ReLU", "Linear"]
 
 

@@ -36,7 +36,7 @@ class Given(DistanceAnnotator):
     """Sees the distances it is given."""
 
     def __init__(self, distances):
-        super().__init__((1.0, 2.0, 3.0, 4.0), budget=9)
+        super().__init__((1.0, 2.0, 3.0, 4.0), dt=0.008, budget=9)
         self.distances = np.array(distances, float)
 
     def distance(self, qpos, qvel, demo_step):

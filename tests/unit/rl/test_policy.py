@@ -131,8 +131,8 @@ def test_log_prob_by_hand():
     inputs = torch.zeros(1, trained.input_size)
     with torch.no_grad():
         mean = trained(inputs)
-        at_mean = trained.log_prob(inputs, mean)
-        one_off = trained.log_prob(inputs, mean + math.exp(-0.3))
+        at_mean = trained.log_prob_of(mean, mean)
+        one_off = trained.log_prob_of(mean, mean + math.exp(-0.3))
     # log N(mu) = -log sigma - log sqrt(2 pi) per action; one deviation off costs 1/2 each.
     assert at_mean.item() == pytest.approx(3 * (0.3 - 0.5 * math.log(2 * math.pi)), abs=1e-5)
     assert (at_mean - one_off).item() == pytest.approx(1.5, abs=1e-5)

@@ -41,7 +41,7 @@ def test_pose_is_where_mujoco_puts_the_parts(states):
 
 def test_the_rater_looks_at_the_same_directions(states):
     weights = np.repeat([1.0, 0.7, 0.7, 0.5], 2)
-    seen = appearance(*states)[:, 1:9] / weights
+    seen = appearance(*states, BODY)[:, 1:9] / weights
     np.testing.assert_allclose(BODY.pose(HOPPER.observe(*states))[:, 1:], seen, atol=1e-9)
 
 

@@ -70,6 +70,20 @@ def test_answers_hold_until_they_are_taken_back(store, pairs):
         (pairs[2], "Bob", "equal"), (pairs[0], "Ann", "right"),
     ]  # fmt: skip
     assert store.comparisons.count("r") == 2 and store.comparisons.count("other") == 0
+    bob_skips = store.comparisons.compare(pairs[1], bob, "skip", 800)
+    with pytest.raises(ValueError, match="answered already"):
+        store.comparisons.compare(pairs[1], bob, "skip", 800)
+    assert store.comparisons.compare(pairs[1], bob, "skip", 0, reason="too dark") > bob_skips
+    for answer, reason in (("skip", "again"), ("left", "why"), ("skip", ""), ("skip", "x" * 201)):
+        with pytest.raises(ValueError, match=r"answered already|a reason is"):
+            store.comparisons.compare(pairs[1], bob, answer, 0, reason=reason)
+    assert store.comparisons.last_compared("r", bob) == (pairs[1], "skip")
+    store.comparisons.compare(pairs[1], bob, "undo", 0)
+    assert store.comparisons.last_compared("r", bob) == (pairs[2], "equal")
+    reasons = [
+        row[10] for row in store.comparisons.stream_history("r") if row[2] == pairs[1] and row[4] == "Bob"
+    ]
+    assert reasons == [None, "too dark", None]
     for answer in ("both", "", None):
         with pytest.raises(ValueError, match="left, right, equal"):
             store.comparisons.compare(pairs[3], ann, answer, 0)
@@ -116,6 +130,27 @@ def test_the_desk_of_pairs_has_the_rules_of_that_of_clips(store, pairs):
     cy.close()
     clock.now += 0.4
     assert bo.answer(pairs[1], "equal") and bo.current == pairs[2]
+
+
+def test_the_reason_for_a_skipped_pair_may_be_said_until_the_next_press(store, pairs):
+    clock, ann = Clock(), store.accounts.ensure("ann", "annotator")
+    here, there = (ComparisonSession(store, "r", ann, Assignment(), page, clock=clock) for page in (1, 2))
+    here.refill()
+    clock.now += 1
+    assert not here.explain(pairs[0], "not skipped")
+    assert here.answer(pairs[0], "skip") and here.skipped == pairs[0]
+    assert not here.explain(pairs[1], "dark") and here.explain(pairs[0], "dark") and here.explained
+    assert not here.explain(pairs[0], "again")
+    clock.now += 1
+    assert here.answer(pairs[1], "skip") and not here.explained
+    assert there.undo(pairs[1]) and not here.explain(pairs[1], "it was taken back elsewhere")
+    clock.now += 1
+    assert here.answer(pairs[2], "left") and here.skipped is None
+    said = store.database.rows("SELECT pair_id, answer, reason FROM comparisons ORDER BY id")
+    assert said == [
+        (pairs[0], "skip", None), (pairs[0], "skip", "dark"), (pairs[1], "skip", None),
+        (pairs[1], "undo", None), (pairs[2], "left", None),
+    ]  # fmt: skip
 
 
 def test_nobody_waits_for_themselves_and_what_was_fetched_ahead_is_asked_for_again(store, pairs):

@@ -205,7 +205,7 @@ def laws(path):
 @pytest.mark.parametrize(
     ("number", "said"),
     [
-        (1, "was written before onedemo 0.1.0 .schema version 1, this one reads 5 to 9.; open it with"),
+        (1, "was written before onedemo 0.1.0 .schema version 1, this one reads 5 to 10.; open it with"),
         (4, "was written before onedemo 0.1.0 .schema version 4, "),
         (max(STEPS) + 1, "was written by a newer onedemo .*; update onedemo to open it"),
     ],

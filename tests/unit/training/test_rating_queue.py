@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import pytest
@@ -69,16 +70,22 @@ def test_an_excluded_rater_s_share_is_asked_again_before_practice(store, tmp_pat
     assert training.queue.given() == 8
 
 
-def test_pause_and_stop_are_told_at_once_within_an_iteration(store, tmp_path):
-    settings = {"rollouts__steps": 6_000, "rollouts__total_steps": 10**9, "ratings__pretrain": 1}
-    training = make_run(store, tmp_path, settings=settings)
+def test_pause_and_stop_are_told_at_once_within_an_iteration(store, tmp_path, monkeypatch):
+    begun, go_on, iterate = threading.Event(), threading.Event(), TrainingRun.iterate
+
+    def long(self):
+        begun.set()
+        assert go_on.wait(60)
+        iterate(self)
+
+    monkeypatch.setattr(TrainingRun, "iterate", long)
+    training = make_run(store, tmp_path, settings={"ratings__pretrain": 1})
     trainer, ann = Trainer(training), store.accounts.ensure("Ann", "annotator")
     trainer.start()
     until = time.monotonic() + 60
-    while trainer.status().phase != "online" or training.snapshot is None:
+    while not begun.wait(0.02):
         assert time.monotonic() < until
         rate_all(store, ann)
-        time.sleep(0.02)
     iteration = trainer.status().iteration
     trainer.pause()
     assert trainer.status().phase == "pausing"
@@ -86,6 +93,7 @@ def test_pause_and_stop_are_told_at_once_within_an_iteration(store, tmp_path):
     assert trainer.status().phase == "online"
     trainer.stop(timeout_s=0)
     assert trainer.status().phase == "stopping" and trainer.status().iteration == iteration
+    go_on.set()
     trainer.stop()
     assert trainer.status().phase == "stopped"
 
@@ -106,10 +114,12 @@ def test_looking_tells_how_far_it_is_and_only_where_it_takes_time(store, tmp_pat
     told = []
 
     class Look:
-        def knows(self, features):
-            return False
+        reach = 1.6
 
-    def learn(env, encoder, cache, check):
+        def track(self, masks, fps):
+            return None
+
+    def learn(env, cache, check):
         for share in (0.0, 0.25, 0.5):
             time.sleep(0.02)
             check(share)
@@ -129,4 +139,4 @@ def test_looking_tells_how_far_it_is_and_only_where_it_takes_time(store, tmp_pat
 
     training._learn_robot = lambda *_: Look()  # learned before: nothing is said of pictures
     training.look()
-    assert "video" in training.preparing
+    assert "looked for in the demonstration video" in training.preparing

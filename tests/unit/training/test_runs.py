@@ -206,7 +206,7 @@ def test_a_run_of_before_robots_were_noted_goes_on(store, tmp_path):
 
 def test_a_demo_of_another_robot_is_refused(store, tmp_path):
     made = replace(DEMO, robot="walker2d")
-    with pytest.raises(UserError, match="demo flip was made with robot walker2d, and hopper cannot"):
+    with pytest.raises(UserError, match="shows robot 'walker2d', but this run's robot is"):
         add_run(store, tmp_path, made, load_config(), name=None)
     assert not store.runs.all()
     assert add_run(store, tmp_path, made, load_config(None, {"env": "walker2d"}), name=None) == "flip-1"

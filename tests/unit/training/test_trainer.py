@@ -1,5 +1,4 @@
 import ast
-import functools
 import os
 import re
 import subprocess
@@ -29,8 +28,7 @@ from onedemo.training.runs import add_run, find_run
 from onedemo.training.simulated_run import train
 from onedemo.training.thread import Trainer
 from onedemo.training.training_run import TrainingRun
-from onedemo.vision.pose_estimator import learn as learn_robot
-from onedemo.vision.pose_estimator import regress
+from onedemo.vision.silhouette import learn as learn_robot
 
 
 @pytest.fixture(scope="module")
@@ -240,17 +238,24 @@ def held_by_another(path):
     return done.returncode != 0
 
 
-def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, demo):
-    """Amid an iteration of many seconds: a second process is refused, then so is this one, then nobody."""
-    config = small_config(rollouts__steps=6_000, rollouts__total_steps=10**9, ratings__pretrain=1)
+def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, demo, monkeypatch):
+    """Amid an iteration: a second process is refused, then so is this one, then nobody."""
+    begun, go_on, iterate = threading.Event(), threading.Event(), TrainingRun.iterate
+
+    def long(self):
+        begun.set()
+        assert go_on.wait(60)
+        iterate(self)
+
+    monkeypatch.setattr(TrainingRun, "iterate", long)
+    config = small_config(rollouts__total_steps=10**9, ratings__pretrain=1)
     training = make_run(store, demo, config=config)
     with ExitStack() as held:
         held.enter_context(hold(training.files.lock))
         trainer_ = Trainer(training, held.pop_all())
     ann = store.accounts.ensure("Ann", "annotator")
     trainer_.start()
-    wait_for(lambda: rate_all(store, "r", ann) or (trainer_.status().phase == "online"))
-    wait_for(lambda: trainer_.status().snapshot == 1)
+    wait_for(lambda: rate_all(store, "r", ann) or begun.is_set())
     trainer_.stop(timeout_s=0.01)
     trainer_.release()
     assert trainer_.status().phase == "stopping" and trainer_.status().iteration == 0
@@ -258,6 +263,7 @@ def test_a_run_whose_stop_timed_out_is_held_until_its_thread_has_ended(store, de
     with pytest.raises(UserError, match="another onedemo is working on"), hold(training.files.lock):
         pass
     assert trainer_.status().iteration == 0  # all of that within the iteration
+    go_on.set()
     trainer_.stop()
     assert trainer_.status().phase == "stopped" and trainer_.status().iteration == 1
     assert not held_by_another(training.files.lock)
@@ -301,13 +307,10 @@ def test_people_rate_while_the_robot_is_looked_at_and_may_stop(store, demo):
     ann = store.accounts.ensure("Ann", "annotator")
     looked = threading.Event()
 
-    def look(env, encoder, cache_dir, check):
+    def look(env, cache_dir, check):
         while not looked.wait(0.05):
             check()
-        rng = np.random.default_rng(0)
-        return regress(
-            rng.normal(size=(40, 64)).astype(np.float32), rng.normal(size=(40, 9)).astype(np.float32)
-        )
+        return learn_robot(env, cache_dir, check)
 
     config = small_config(method="onedemo", ratings__pretrain=30)
     trainer_ = make_trainer(store, demo, config=config, learn_robot=look)
@@ -455,6 +458,9 @@ LEARNING = (
     "reward.two_branch_net",
     "reward.learned_distance",
     "vision.pose_estimator",
+    "vision.silhouette",
+    "vision.silhouette_pictures",
+    "vision.masks",
     "sim.kinematics",
     "rl.random_states",
     "reward.episode_rules",
@@ -516,10 +522,6 @@ class Mixed(Thumbnail):
         return super().encode(frames) @ mixture
 
 
-learn_robot_roughly = functools.partial(learn_robot, count=80, epochs=4)
-"""From few pictures: enough to see poses by, if badly."""
-
-
 def watched_run(store, demo, config):
     """A whole run rated by a rule, during which no hidden file may be opened; its end."""
     global _watching
@@ -527,9 +529,7 @@ def watched_run(store, demo, config):
     _watching = True
     try:
         rater = Simulated(name="rule", rate=by_rule)
-        training = make_run(
-            store, demo, rater, config=config, encoder=Mixed(), learn_robot=learn_robot_roughly
-        )
+        training = make_run(store, demo, rater, config=config, encoder=Mixed())
         work(training)
     finally:
         _watching = False
@@ -581,7 +581,7 @@ ONEDEMO = {"method": "onedemo", "ratings__rounds": 2, "practice__give_up": 0.3}
 
 @pytest.mark.seam
 def test_the_method_with_its_own_pictures_learns_the_same_from_noise(tmp_path):
-    """PoseEstimator, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
+    """Silhouettes, choice of clips, clock, bank: none of it comes from the demo's hidden states."""
     demo = drawn_demo(tmp_path / "demo")
     learner, snapshot = learns_the_same_from_noise(
         demo, tmp_path, small_config(**ONEDEMO, rollouts__total_steps=800)
@@ -599,7 +599,7 @@ def test_a_run_of_the_method_is_the_same_after_a_stop_and_on_two_threads(tmp_pat
     for name, threads in (("whole", 1), ("stopped", 1), ("two", 2)):
         settings = {"ratings__online": 0, "rollouts__total_steps": 1600, "rollouts__threads": threads}
         config = small_config(**ONEDEMO, **settings)
-        options = {"config": config, "encoder": Mixed(), "learn_robot": learn_robot_roughly}
+        options = {"config": config, "encoder": Mixed()}
         store = Store(tmp_path / name)
         if name == "stopped":
             work(make_run(store, demo, rater, **options), iterations=2)

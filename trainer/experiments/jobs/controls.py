@@ -29,6 +29,7 @@ from onedemo.reward.model import CLASSES, PredictorConfig, Snapshot
 from onedemo.rl.policy import Policy
 from onedemo.rl.trpo import TrpoConfig
 from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import Robot
 from onedemo.sim.kinematics import body_of
 from onedemo.training.learner import Learner
 from onedemo.types import Demo
@@ -106,12 +107,12 @@ def truth(settings: Mapping[str, Any], seed: int, scratch: Path) -> dict[str, An
     config = load_config(None, given | settings.get("set", {}))
     torch.set_num_threads(1)
     learner = Learner(config, demo.frames, demo.fps)
-    shown = hidden.obs[_steps(demo, hidden)]
     body = body_of(robot_named(config.env))
-    track = Track(pose=body.pose(shown).astype(np.float32), motion=body.motion(shown).astype(np.float32))
+    seen = body.seen(hidden.obs[_steps(demo, hidden, body.robot)])
+    track = Track(**{name: x.astype(np.float32) for name, x in seen._asdict().items()})
     learner.look_at(track.pose, track)
-    snapshot = TrueRating(demo, hidden)
-    watch = Watch(hidden, config.rollouts.total_steps)
+    snapshot = TrueRating(demo, hidden, config.env)
+    watch = Watch(hidden, config.rollouts.total_steps, config.env)
     while learner.env_steps < config.rollouts.total_steps:
         learner.iterate(snapshot)
         watch(learner, snapshot)
@@ -136,19 +137,21 @@ class TrueRating(Snapshot):
     Args:
         demo: Whose frames are meant.
         hidden: Its states.
+        robot: Name of the robot.
     """
 
-    def __init__(self, demo: Demo, hidden: HiddenStates) -> None:
+    def __init__(self, demo: Demo, hidden: HiddenStates, robot: str = "hopper") -> None:
         super().__init__(number=1, config=PredictorConfig())
-        steps = _steps(demo, hidden)
-        self._oracle = Oracle(hidden, budget=0)
-        self._demo = appearance(hidden.qpos[steps], hidden.qvel[steps])
+        self._oracle = Oracle(hidden, robot, budget=0)
+        self._body = self._oracle.body
+        steps = _steps(demo, hidden, self._body.robot)
+        self._demo = appearance(hidden.qpos[steps], hidden.qvel[steps], self._body)
 
     def member_probabilities(self, frames: np.ndarray, obs: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Certainty about the one true rating, by the one member."""
-        # An observation lacks x alone, which cannot be seen.
-        qpos = np.concatenate([np.zeros_like(obs[..., :1]), obs[..., :5]], axis=-1)
-        distance = np.linalg.norm(self._demo[frames] - appearance(qpos, obs[..., 5:]), axis=-1)
+        # An observation lacks the place on the floor alone, which cannot be seen.
+        seen = appearance(*self._body.robot.state(obs), self._body)
+        distance = np.linalg.norm(self._demo[frames] - seen, axis=-1)
         return np.eye(CLASSES, dtype=np.float32)[self._oracle.rating_of(distance) - 1][None]
 
     def tensors(self) -> dict[str, Any]:
@@ -169,9 +172,9 @@ def _baseline(demo: Demo, policy: Policy, curve: Sequence[Score]) -> dict[str, A
     }
 
 
-def _steps(demo: Demo, hidden: HiddenStates) -> np.ndarray:
+def _steps(demo: Demo, hidden: HiddenStates, robot: Robot) -> np.ndarray:
     """Control step that each frame shows."""
-    steps = steps_of_frames(demo.frames, robot_named("hopper").dt, demo.fps)
+    steps = steps_of_frames(demo.frames, robot.dt, demo.fps)
     return np.minimum(steps, len(hidden.qpos) - 1)
 
 

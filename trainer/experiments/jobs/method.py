@@ -10,7 +10,7 @@ result, which the controls have in the same form:
 - ``episode``: positions of the best episode at the demo's frames, and which one it is;
 - ``ratings``, ``ratings_by_class``, ``env_steps`` and ``seconds`` by what they were spent on.
 
-Shapes: N = 16 episodes, T control steps, q = 6 positions.
+Shapes: N = 16 episodes, T control steps, q positions.
 """
 
 from __future__ import annotations
@@ -40,12 +40,14 @@ from onedemo.training.learner import Learner
 from onedemo.training.simulated_run import train
 from onedemo.types import Demo
 from onedemo.vision.encoders import demo_features, make_encoder
-from onedemo.vision.pose_estimator import learn as learn_pose_estimator
+from onedemo.vision.silhouette import seen_in
 
 POINTS = 12
 """Of a learning curve."""
-CURVES = ("net_turns", "clean_turns", "landings", "backflip_reward", "hop_return", "aligned_similarity")
-"""Figures that are followed during a training."""
+CURVES = (
+    "net_turns", "clean_turns", "landings", "backflip_reward", "hop_return", "aligned_similarity", "travel",
+)  # fmt: skip
+"""Figures that are followed during a training, where the robot has them."""
 
 _ERROR_EVERY = 10
 """Control steps over which the error of the states is averaged."""
@@ -112,7 +114,7 @@ def run(
     demo = find_demo(settings["demo"], cache / "demos")
     encoder = prepare(demo, config, cache)
     hidden = hidden_of(demo)
-    watch = Watch(hidden, config.rollouts.total_steps)
+    watch = Watch(hidden, config.rollouts.total_steps, config.env)
     prepared = time.monotonic()
     store = Store(scratch)
     try:
@@ -162,7 +164,7 @@ def prepare(demo: Demo, config: RunConfig, cache: Path) -> Any:
         demo_features(demo, encoder, cache / "demos")
     if config.predictor.appearance:
         with hold(cache / "robots" / "lock", wait=True):
-            learn_pose_estimator(config.env, encoder, cache / "robots")
+            seen_in(demo, config.env, cache / "robots")
     return encoder
 
 
@@ -178,14 +180,15 @@ class Watch:
     Args:
         hidden: The demo's states; None leaves out what compares with them.
         total_steps: Control steps at which the training ends.
+        robot: Name of the robot.
     """
 
     learner: Learner
     """As of the last call."""
     snapshot: Snapshot
 
-    def __init__(self, hidden: HiddenStates | None, total_steps: int) -> None:
-        self._oracle = oracle_of(hidden)
+    def __init__(self, hidden: HiddenStates | None, total_steps: int, robot: str = "hopper") -> None:
+        self._oracle, self._robot = oracle_of(hidden, robot), robot
         self._total_steps = total_steps
         self._curve: dict[str, list[float | None]] = {name: [] for name in ("env_steps", *CURVES)}
         self._last: tuple[Episodes, dict[str, np.ndarray | None]] | None = None
@@ -201,12 +204,12 @@ class Watch:
         due = (len(self._curve["env_steps"]) + 1) * self._total_steps / POINTS
         if learner.env_steps >= min(due, self._total_steps):
             episodes = perform(learner, snapshot)
-            values = per_episode(episodes, self._oracle)
+            values = per_episode(episodes, self._oracle, self._robot)
             values["predicted_similarity"] = predicted_similarity(episodes)
             self._last = episodes, values
             self._curve["env_steps"].append(learner.env_steps)
             for name in CURVES:
-                each = values[name]
+                each = values.get(name)
                 self._curve[name].append(None if each is None else round(float(np.mean(each)), 4))
         self.ended = time.monotonic()
         self.seconds += self.ended - began
@@ -214,25 +217,26 @@ class Watch:
     def result(self, demo: Demo) -> dict[str, Any]:
         """``curve``, and what ``outcome`` gives for the last evaluation."""
         assert self._last is not None, "the training has not come to its end"
-        return {"curve": self._curve, **outcome(*self._last, demo, self._oracle)}
+        return {"curve": self._curve, **outcome(*self._last, demo, self._oracle, self._robot)}
 
 
-def oracle_of(hidden: HiddenStates | None) -> Oracle | None:
+def oracle_of(hidden: HiddenStates | None, robot: str = "hopper") -> Oracle | None:
     """An oracle that gives no ratings and only evaluates."""
-    return None if hidden is None else Oracle(hidden, budget=0)
+    return None if hidden is None else Oracle(hidden, robot, budget=0)
 
 
 def outcome(
-    episodes: Episodes, values: Mapping[str, np.ndarray | None], demo: Demo, oracle: Oracle | None
-) -> dict[str, Any]:
+    episodes: Episodes, values: Mapping[str, np.ndarray | None], demo: Demo, oracle: Oracle | None,
+    robot: str = "hopper",
+) -> dict[str, Any]:  # fmt: skip
     """What there is to keep of the final policy's episodes: ``figures``, ``errors``, ``episode``.
 
     The best episode is the one most like the demo after alignment; where that is not known, the one with
-    the most turns.
+    the most turns, or which went farthest.
     """
-    alike = values.get("aligned_similarity")
-    best = int(np.argmax(alike if alike is not None else values["net_turns"]))  # type: ignore[arg-type]
-    steps = steps_of_frames(demo.frames, robot_named("hopper").dt, demo.fps)
+    by = ("aligned_similarity", "net_turns", "travel")
+    best = int(np.argmax(next(each for name in by if (each := values.get(name)) is not None)))
+    steps = steps_of_frames(demo.frames, robot_named(robot).dt, demo.fps)
     steps = np.minimum(steps, episodes.qpos.shape[1] - 1)
     return {
         "figures": {name: _figure(name, each) for name, each in values.items()},
@@ -251,10 +255,10 @@ def _figure(name: str, values: np.ndarray | None) -> dict[str, Any] | None:
 def _errors(episodes: Episodes, oracle: Oracle | None, best: int) -> dict[str, Sequence[float]] | None:
     if oracle is None:
         return None
-    errors = state_errors(episodes.obs, oracle.hidden.obs)
+    errors = state_errors(episodes.obs, oracle.hidden.obs, oracle.body.robot.name)
     points = errors.shape[1] // _ERROR_EVERY
     errors = errors[:, : points * _ERROR_EVERY].reshape(len(errors), points, _ERROR_EVERY).mean(axis=-1)
-    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * robot_named("hopper").dt
+    seconds = (np.arange(points) + 0.5) * _ERROR_EVERY * oracle.body.robot.dt
     figures = {"seconds": seconds, "best": errors[best], "mean": errors.mean(axis=0)}
     return {name: [round(float(x), 4) for x in values] for name, values in figures.items()}
 

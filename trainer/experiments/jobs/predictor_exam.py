@@ -97,7 +97,7 @@ class Exam:
         rng = np.random.default_rng([_STREAM, self._seed, 1])  # the same tries for all predictors
         tries = self._learner.config.practice.bank_tries
         buffer = fill_reset_buffer(
-            snapshot, self._wild, frames_of, self._learner.demo_steps, rng, tries=tries
+            snapshot, self._wild, frames_of, self._learner.demo_steps, rng, tries=tries, dt=self._learner.dt
         )
         picked = [
             self._oracle.distance(qpos[None], qvel[None], int(step))[0]

@@ -28,8 +28,9 @@ from onedemo.reward.model import CLASSES, Snapshot
 from onedemo.storage.rating_records import RatedSegment
 from onedemo.training.learner import Learner
 from onedemo.types import Demo
-from onedemo.vision import pose_estimator
 from onedemo.vision.encoders import demo_features
+from onedemo.vision.pose_estimator import Track
+from onedemo.vision.silhouette import seen_in
 
 _NETWORK = {"method": "paper"}
 _ONE_LAYER_LESS = _NETWORK | {"predictor.additional_layer": False}
@@ -183,12 +184,13 @@ def unseen(
 @dataclass(frozen=True, kw_only=True, slots=True)
 class _Scene:
     features: np.ndarray
-    track: pose_estimator.Track
+    track: Track
 
 
 def _look(demo: Demo, kept: Path) -> _Scene:
     """What onedemo sees of a demo: frame features, and poses in them."""
     encoder = prepare(demo, load_config(), kept)  # one job at a time
     features = demo_features(demo, encoder, kept / "demos")
-    look = pose_estimator.learn(load_config().env, encoder, kept / "robots")
-    return _Scene(features=features, track=look.track(features, demo.fps))
+    track = seen_in(demo, load_config().env, kept / "robots")
+    assert track is not None, "the demo shows the robot"
+    return _Scene(features=features, track=track)

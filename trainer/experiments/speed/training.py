@@ -30,7 +30,7 @@ _FRAMES, _FPS = 240, 30.0
 def measure(quick: bool = False) -> list[Result]:
     """Training beside bare physics, and the learned reward's share of it."""
     with one_thread():
-        return _against_physics(3 if quick else 25)
+        return _against_physics(*((2, 100) if quick else (25, STEPS)))
 
 
 @contextmanager
@@ -78,14 +78,14 @@ def learner_and_snapshot(config: RunConfig, ratings: int = 350) -> tuple[Learner
     return learner, learner.fit(given, 1)[0]
 
 
-def _against_physics(turns: int) -> list[Result]:
+def _against_physics(turns: int, steps: int) -> list[Result]:
     config = load_config(
         None,
         {
             "method": "paper",
             "predictor.visual_dims": 24,
             "rollouts.lanes": LANES,
-            "rollouts.steps": STEPS,
+            "rollouts.steps": steps,
             "rollouts.threads": cores(),
         },
     )
@@ -114,7 +114,7 @@ def _against_physics(turns: int) -> list[Result]:
     bare.close()
     return [
         ratio(
-            "train_vs_physics", f"training: collection, scoring, TRPO update, {LANES} x {STEPS} steps",
+            "train_vs_physics", f"training: collection, scoring, TRPO update, {LANES} x {steps} steps",
             ours=rates["ours"], theirs=rates["bare"], against=f"mujoco.rollout bare, {cores()} threads",
             reach=0.75, unit="steps/s",
             equal="each turn, bare physics steps the lanes of the iteration before with the same actions",
