@@ -66,6 +66,8 @@ class WarpPhysics:
         self, model: mujoco.MjModel, frame_skip: int, num_envs: int, device: str | None = None,
         *, room: tuple[int, int] | None = None,
     ) -> None:  # fmt: skip
+        if model.na:
+            raise UserError("the warp physics does not keep what this robot's actuators remember")
         self.device = _device(device)
         self._duration = frame_skip * model.opt.timestep
         self._motors = model.nq + model.nv
