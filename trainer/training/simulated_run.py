@@ -16,10 +16,11 @@ from onedemo.core.files import hold
 from onedemo.demos.ground_truth import hidden_path, load_hidden
 from onedemo.evaluation.episodes import summarise
 from onedemo.reward.model import Snapshot
+from onedemo.robots.registry import robot_named
 from onedemo.storage.store import Store
 from onedemo.training.learner import Learner
 from onedemo.training.rating_queue import Simulated
-from onedemo.training.runs import add_run, find_run, program_version
+from onedemo.training.runs import add_run, check_robot, find_run, program_version
 from onedemo.training.training_run import TrainingRun
 from onedemo.types import Demo
 from onedemo.vision.encoders import Encoder
@@ -61,6 +62,7 @@ def train(
         UserError: If the rater or the demo is not fit for it.
     """
     began = time.monotonic()
+    check_robot(demo, robot_named(config.env).name)
     hidden_file = hidden_path(demo.path)
     hidden = load_hidden(hidden_file) if hidden_file.exists() else None
     given = sum(store.ratings.by_class(name)) if name else 0

@@ -70,7 +70,7 @@ def test_backflips_begin_within_16_thousand_steps():
 
 
 def test_command_line_says_what_is_wrong():
-    with pytest.raises(UserError, match="backflip, hop"):
+    with pytest.raises(UserError, match="backflip, forward, hop"):
         tiny("flop")
     with pytest.raises(UserError, match="steps must be at least 1"):
         tiny(steps=0)

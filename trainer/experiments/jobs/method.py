@@ -84,6 +84,8 @@ def whole_config(settings: Mapping[str, Any]) -> dict[str, str]:
     """``{"config": digest}`` of all settings of a run, defaults too: a changed default makes another job."""
     config = asdict(run_config({"ratings": 350, "set": {}, **settings}, 0))
     del config["storage"]  # what a run leaves on the disk changes no result
+    if not config["env_sha256"]:  # the model is the one that comes with the program
+        del config["env_sha256"]
     for section, constants in _ONCE_CONSTANT.items():
         for name, value in constants.items():
             if config[section][name] == value:
