@@ -39,7 +39,7 @@ _CYCLES = 3
 _BATCH = 12
 """Films at a time."""
 _RATE = 2e-3
-_DRAWING = 0.25
+_DRAWING = 0.35
 """Share of the time that drawing takes, as measured."""
 _WIDTH = 96
 _HELD_OUT = 0.1
