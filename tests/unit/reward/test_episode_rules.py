@@ -22,7 +22,7 @@ from onedemo.rl.rollouts import Collector, Step
 from onedemo.sim import vector_env
 
 DEMO_STEPS = 400
-DT = 0.01
+DT = 0.008
 
 
 class Places(Snapshot):
