@@ -84,7 +84,8 @@ def test_what_moves_is_shown_marked_and_kept(chromium, site, tmp_path):
         refused = page.evaluate(
             """async (place) => {
               const headers = { "Content-Type": "application/json", ...page.named() };
-              const answer = await fetch(place, { method: "POST", headers, body: '{"box": [0, 0, 4, 4, 0]}' });
+              const body = '{"box": [0, 0, 4, 4, 0]}';
+              const answer = await fetch(place, { method: "POST", headers, body });
               return [answer.status, await answer.text()];
             }""",
             given.value.url,
