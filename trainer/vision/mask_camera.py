@@ -47,7 +47,7 @@ class Motion:
         return np.einsum("fij,fj->fi", self.maps, at) - place[:-1]
 
     def pace(self, size: tuple[int, int]) -> np.ndarray:
-        """By how much some places of pictures of H rows and W columns usually move, (5,), pixels."""
+        """Pixels that some places of pictures of H rows and W columns usually move to the next, (5,)."""
         rows, columns = size
         moves = []
         even = np.ones((9, 1)) / 9  # grain shakes single moves, a camera that goes goes on
