@@ -22,7 +22,7 @@ RACING = """
       <geom type="capsule" fromto="-0.1 0 0 0.1 0 0" size="0.01" mass="0.001"/>
     </body>
   </worldbody>
-  <actuator><motor joint="spin" gear="75"/></actuator>
+  <actuator><motor joint="spin" gear="150"/></actuator>
 </mujoco>
 """
 """Its motor is far too strong: after a second of noise every third lane turns at more than any robot does."""
@@ -36,7 +36,14 @@ def test_an_iteration_of_any_robot(name, tmp_path):
         text = RACING if name == "racing" else (ROOT / "tests/data/robots/arm.xml").read_text()
         (tmp_path / "model.xml").write_text(text)
         add_robot(tmp_path / "model.xml", tmp_path, name=name)
-        config = small_config(env=name, method="onedemo", predictor__appearance=False, predictor__members=1)
+        config = small_config(
+            env=name,
+            method="onedemo",
+            predictor__appearance=False,
+            predictor__members=1,
+            practice__give_up=0.0,
+            practice__bank_share=0.0,
+        )
         learner = Learner(config, FRAMES, 30.0)
         learner.look_at(np.random.default_rng(0).normal(size=(FRAMES, 20)).cumsum(axis=0).astype(np.float32))
         rollouts = learner.random_rollouts()
