@@ -138,15 +138,16 @@ def appearance(qpos: np.ndarray, qvel: np.ndarray, body: Body) -> np.ndarray:
     return np.concatenate(parts, axis=-1)
 
 
-def thresholds_of(body: Body) -> np.ndarray:
-    """Distances beyond which the oracle takes one point off, (4,).
+def thresholds_of(body: Body) -> list[float]:
+    """The four distances beyond which the oracle takes one point off.
 
     The more limbs are compared, the farther apart are two poses that have nothing in common: in proportion to
     the root of the sum of squared weights, of which directions in space show two thirds in a picture. The
     hopper's thresholds are scaled by that.
     """
     shown = 1.0 if body.planar else 2 / 3
-    return np.array(THRESHOLDS) * np.sqrt(shown * np.square(body.weights).sum() / _MEANT_FOR)
+    scale = float(np.sqrt(shown * np.square(body.weights).sum() / _MEANT_FOR))
+    return [scale * threshold for threshold in THRESHOLDS]
 
 
 def make_rater(

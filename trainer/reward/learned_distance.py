@@ -51,9 +51,8 @@ _SPREAD = 0.3
 """Of the weights of an imagined track to begin with."""
 _RIDGE = 0.004
 """Of the penalty on them, a standard normal prior for about 125 ratings."""
-_PRIOR = {"pose": -1.0, "motion": -2.0, "travel": 1.0, "contact": -2.0}
-"""Log weights before any rating: a difference in pose counts more than one in motion, and one in travel most,
-since the floor goes by in all of the picture: standing beside 2.5 m/s is then a 3 if all else is alike."""
+_PRIOR = {"pose": -1.0, "motion": -2.0, "travel": -1.0, "contact": -2.0}
+"""Log weights before any rating: a difference in pose or travel counts more than one in motion."""
 _USUAL = 9
 """Numbers of a pose for which the prior is meant; the more there are, the less does each count."""
 PARTS = ("travel", "contact")

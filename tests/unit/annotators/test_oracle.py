@@ -208,7 +208,7 @@ def test_a_hopper_is_seen_as_ever():
         parts += [weight * np.sin(angle), weight * np.cos(angle)]
     parts += [0.15 * np.clip(qvel[:, 2], -10, 10), 0.15 * qvel[:, 1], 0.08 * qvel[:, 0]]
     np.testing.assert_allclose(appearance(qpos, qvel, HOPPER), np.stack(parts, axis=-1), atol=1e-12)
-    assert thresholds_of(HOPPER).tolist() == list(THRESHOLDS)
+    assert thresholds_of(HOPPER) == list(THRESHOLDS)
 
 
 @pytest.mark.parametrize("name", ["walker2d", "half-cheetah", "swimmer", "ant", "humanoid"])

@@ -173,7 +173,7 @@ def test_a_start_that_never_saw_travel_begins_there_with_the_prior():
     rows = start.weights_for(view)
     assert rows.shape == (1, 20)
     np.testing.assert_array_equal(rows[:, :18], start.log_weights[:, :18])
-    assert rows[0, 18] == 1.0 and rows[0, 19] == start.log_weights[0, 18]
+    assert rows[0, 18] == -1.0 and rows[0, 19] == start.log_weights[0, 18]
     beside = start.beside(view)
     assert beside is not None and beside.parts == PARTS
     blind = view_of("hopper", rollouts.obs[2, :FRAMES], travel=None, contact=None)

@@ -237,7 +237,8 @@ def outcome(
     the most turns, or which went farthest.
     """
     by = ("aligned_similarity", "net_turns", "travel")
-    best = int(np.argmax(next(each for name in by if (each := values.get(name)) is not None)))
+    known = [each for name in by if (each := values.get(name)) is not None]
+    best = int(np.argmax(known[0]))
     steps = steps_of_frames(demo.frames, robot_named(robot).dt, demo.fps)
     steps = np.minimum(steps, episodes.qpos.shape[1] - 1)
     return {
