@@ -58,7 +58,7 @@ def test_any_runs_are_compared():
 def test_the_form_says_what_the_settings_say():
     said = {key: meaning for key, _, meaning in describe()}
     fields = {field["key"]: field for field in fields_of(to_toml(load_config(None, {"ratings.pretrain": 7})))}
-    assert {*fields, "ratings.choice"} == set(OFFERED)
+    assert {*fields, "env", "ratings.choice"} == set(OFFERED)
     for key, field in fields.items():
         assert field["said"] == said[key] and field["wrong"].startswith("This is a ")
     assert (fields["ratings.pretrain"]["value"], fields["ratings.pretrain"]["usual"]) == (7, "200")
