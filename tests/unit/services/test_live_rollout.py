@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from helpers.fake_trainer import Wobble
-from onedemo.app.services.live_rollout import Live
+from helpers.paths import ROOT
+from onedemo.app.services.live_rollout import Live, followed
 from onedemo.rl.rollouts import Acting, EpisodeRules
+from onedemo.robots.registry import robot_named
+from onedemo.robots.robot import build
 
 
 class Hurrying(EpisodeRules):
@@ -65,3 +68,12 @@ def test_the_demo_plays_alone_until_something_acts():
         first = next(moment for moment in moments if moment.acting)
         assert first.demo_seconds == first.seconds < 0.3  # both from the start
         wait_for(lambda: np.abs(moments[-1].xpos - standing).max() > 0.01)
+
+
+def test_a_camera_goes_along_with_what_moves_and_stands_before_what_stays():
+    arm = build("arm", ROOT / "tests/data/arm.xml", frame_skip=5)
+    names = ("hopper", "walker2d", "ant", "humanoid", "swimmer")
+    along = {name: followed(robot_named(name)).tolist() for name in names}
+    assert along["hopper"] == along["walker2d"] == [1, 0, 0]
+    assert along["ant"] == along["humanoid"] == along["swimmer"] == [1, 1, 0]
+    assert followed(arm).tolist() == [0, 0, 0]

@@ -212,3 +212,13 @@ def test_a_demo_of_another_robot_is_refused(store, tmp_path):
     assert add_run(store, tmp_path, made, load_config(None, {"env": "walker2d"}), name=None) == "flip-1"
     with pytest.raises(UserError, match="unknown robot 'nobody'"):
         add_run(store, tmp_path, made, load_config(None, {"env": "nobody"}), name=None)
+
+
+def test_a_demo_of_another_robot_is_refused_before_anything_is_written(store, tmp_path):
+    config = load_config(None, {"env": "walker2d"})
+    demo = replace(DEMO, robot="hopper")
+    with pytest.raises(UserError, match="shows robot 'hopper', but this run's robot is 'walker2d': choose"):
+        add_run(store, tmp_path, demo, config, name=None)
+    assert store.runs.all() == [] and not (tmp_path / "runs").exists()
+    add_run(store, tmp_path, replace(DEMO, robot="walker2d"), config, name="own")
+    add_run(store, tmp_path, DEMO, config, name="any")  # a video of no robot in particular
