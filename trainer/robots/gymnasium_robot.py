@@ -45,7 +45,7 @@ def make(name: str) -> Robot:
         actions = getattr(env.action_space, "shape", None)
     finally:
         env.close()
-    if not isinstance(model, mujoco.MjModel) or not Path(file).is_file() or not skip:
+    if model is None or not isinstance(model, mujoco.MjModel) or not Path(file).is_file() or not skip:
         raise UserError(
             f"{name} does not say which MuJoCo model it has and how long a control step is; if you have its "
             "MJCF file, add that: onedemo robot add MODEL.xml"

@@ -225,8 +225,8 @@ class Learner:
         self.seconds = {"rollouts": collected - began, "policy": time.perf_counter() - collected}
         self.iteration += 1
         self.env_steps += rollouts.clock.size
-        figures = {"predicted": float(predicted), **asdict(stats)}
-        return rollouts, figures | ({"unstable": lost} if lost else {})
+        figures: dict[str, float] = {"predicted": float(predicted), **asdict(stats)}
+        return rollouts, figures | ({"unstable": float(lost)} if lost else {})
 
     def forecast(self, snapshot: Snapshot, ratings: Sequence[RatedSegment]) -> dict[str, float]:
         """How right a snapshot is about ratings that it was not fitted on; draws nothing at random.

@@ -107,7 +107,7 @@ def _map(
     guess = cv2.transform(corners, likely).astype(np.float32)
     after, seen, _ = cv2.calcOpticalFlowPyrLK(here, there, corners, guess, **window)  # type: ignore[call-overload]
     back, again, _ = cv2.calcOpticalFlowPyrLK(there, here, after, corners.copy(), **window)  # type: ignore[call-overload]
-    sure = (seen & again).ravel() > 0
+    sure = np.asarray(seen).ravel().astype(bool) & np.asarray(again).ravel().astype(bool)
     sure &= np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < _ROUND_TRIP
     before, after = corners.reshape(-1, 2)[sure], after.reshape(-1, 2)[sure]
     if len(before) < _FEWEST:

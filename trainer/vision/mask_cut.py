@@ -95,7 +95,7 @@ def seeds_of(evidence: np.ndarray, *, follows: bool) -> tuple[np.ndarray, np.nda
             [np.argwhere(each).mean(axis=0) if each.any() else (np.nan,) * 2 for each in inside]
         )
         away = np.abs(centres - np.nanmedian(centres, axis=0)) if inside.any() else centres
-        inside[(away > 0.2 * inside.shape[2]).any(axis=1)] = False
+        inside[(away > 0.2 * evidence.shape[2]).any(axis=1)] = False
     return inside, outside
 
 
@@ -254,4 +254,6 @@ def _grab(frame: np.ndarray, states: np.ndarray, rounds: int) -> None:
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     with suppress(cv2.error):  # too few pixels of one kind: they stay as they are
-        cv2.grabCut(np.ascontiguousarray(frame), states, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(  # type: ignore[call-overload]
+            np.ascontiguousarray(frame), states, None, *models, rounds, cv2.GC_INIT_WITH_MASK
+        )

@@ -67,8 +67,10 @@ def before_moving(frames: np.ndarray, motion: Motion) -> np.ndarray:
         for other in _neighbours(index, gone, _FAR * width):
             move = joined(motion.maps, other, index)
             aside.append(np.linalg.norm(rows @ move.T - rows[:, :2], axis=1))
-            how = {"flags": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
-            stack.append(cv2.warpAffine(frames[other], move, (width, height), **how))
+            stack.append(cv2.warpAffine(
+                frames[other], move, (width, height), flags=cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            ))  # fmt: skip
         if not stack:
             evidence[index] = UNKNOWN
             continue

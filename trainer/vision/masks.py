@@ -228,13 +228,13 @@ def _by_colour(frames: np.ndarray) -> _Found:
     away = np.hypot((columns + 0.5) / width - 0.5, ((rows + 0.5) / height - 0.5) * height / width)
     inside = np.broadcast_to(away < 0.16, frames.shape[:3])
     outside = np.broadcast_to(away > 0.36, frames.shape[:3])
-    masks = np.zeros(frames.shape[:3], bool)
-    for _ in range(3):
-        colours = Colours(frames, inside, outside)
-        masks, others = cut(frames, None, colours, len(frames) // 2, FOLLOWING)
+    colours = Colours(frames, inside, outside)
+    masks, others = cut(frames, None, colours, len(frames) // 2, FOLLOWING)
+    for _ in range(2):
         if not masks.any():
             break
-        inside, outside = masks, ~_grown(masks)
+        colours = Colours(frames, masks, ~_grown(masks))
+        masks, others = cut(frames, None, colours, len(frames) // 2, FOLLOWING)
     return masks, others, colours.apart
 
 
