@@ -168,7 +168,8 @@ def way_in_studio(frames: np.ndarray, solids: np.ndarray, camera: Camera | None 
         camera: The studio's; the hopper's if None.
     """
     camera = camera or robot_named(DEFAULT).camera
-    pattern = _floor_pattern(*frames.shape[1:3], camera)
+    height, width = frames.shape[1:3]
+    pattern = _floor_pattern(height, width, camera)
     places = [_place(frame[..., 1], solid, pattern) for frame, solid in zip(frames, solids, strict=True)]
     way = np.unwrap(places, period=2) * camera.unit
     return way - way[0]
