@@ -277,7 +277,7 @@ def drawn_model(robot: Robot) -> mujoco.MjModel:
     model.geom_matid[:], model.geom_rgba[:, 3] = -1, 0
     model.geom_group[seen], model.site_group[:] = 0, 5
     for geom in seen:
-        model.geom_rgba[geom] = in_this_light(colours[geom])
+        model.geom_rgba[geom] = in_this_light(colours[geom].tolist())
     return model
 
 
