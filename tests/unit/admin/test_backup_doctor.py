@@ -162,7 +162,10 @@ def test_damaged_files_are_set_aside_and_what_was_in_them_is_made_again(data_dir
             assert file.with_name(f"{file.name}.damaged").exists() and not archive_fault(file.read_bytes())
             assert f"{file} is damaged" in caplog.text
         for name, tensor in fitted.items():
-            torch.testing.assert_close(again[name], tensor, rtol=0, atol=0)
+            if isinstance(tensor, str):
+                assert again[name] == tensor
+            else:
+                torch.testing.assert_close(again[name], tensor, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("at", [None, 0.001, 0.003, 0.99])  # cut off, or turned: in the seal, the rest

@@ -13,12 +13,15 @@ from onedemo.annotators.scripted import Script, load_marks, marked, table_path, 
 from onedemo.demos.library import import_video
 from onedemo.errors import UserError
 from onedemo.robots.hopper import CONTACT_MARGIN, clearances
+from onedemo.robots.registry import robot_named
+from onedemo.sim.kinematics import body_of
 from onedemo.training.learner import Learner
 from onedemo.types import Demo, Segment
 
 TABLE = Path(onedemo.__file__).parent / "experiments" / "jobs" / "person_backflip.json"
 
 DT, STEPS, W = 0.008, 275, 38
+BODY = body_of(robot_named("hopper"))
 
 
 class Untouchable:
@@ -93,7 +96,7 @@ def test_a_whole_turn_and_a_metre_do_not_matter(marks):
     further = qpos.copy()
     further[:, 2] -= 2 * np.pi
     further[:, 0] += 3
-    np.testing.assert_allclose(visible(further, qvel), visible(qpos, qvel), atol=1e-9)
+    np.testing.assert_allclose(visible(further, qvel, BODY), visible(qpos, qvel, BODY), atol=1e-9)
 
 
 def test_what_is_seen_of_marks_and_robot():
@@ -106,8 +109,8 @@ def test_what_is_seen_of_marks_and_robot():
     qpos[:, 1] = [1.25, 1.4]
     qpos[:, 2], qvel[:, 2] = -np.pi / 4, -np.pi / 2
     qpos[0, 1] -= np.minimum.reduce(list(clearances(qpos).values()))[0] - CONTACT_MARGIN / 2
-    np.testing.assert_allclose(visible(qpos, qvel)[0], found[0], atol=1e-9)
-    assert visible(qpos, qvel)[1, 3] == 0.5
+    np.testing.assert_allclose(visible(qpos, qvel, BODY)[0], found[0], atol=1e-9)
+    assert visible(qpos, qvel, BODY)[1, 3] == 0.5
 
 
 @pytest.mark.slow

@@ -567,6 +567,8 @@ def flat(tree):
     """All tensors of a snapshot."""
     if isinstance(tree, torch.Tensor):
         return [tree.numpy()]
+    if isinstance(tree, str):  # of which robot it is
+        return []
     return [x for branch in (tree.values() if isinstance(tree, dict) else tree) for x in flat(branch)]
 
 
