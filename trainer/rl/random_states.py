@@ -88,7 +88,8 @@ def _positions(of: Robot, count: int, rng: np.random.Generator) -> np.ndarray:
         if kind == kinds.mjJNT_BALL:
             qpos[:, at : at + 4] = _turned(count, rng)
         elif limited and kind != kinds.mjJNT_FREE:
-            qpos[:, at] = rng.uniform(*model.jnt_range[joint], count)
+            low, high = model.jnt_range[joint]
+            qpos[:, at] = rng.uniform(low, high, count)
         elif kind == kinds.mjJNT_HINGE:
             qpos[:, at] = rng.uniform(-np.pi, np.pi, count)
         # What else there is stays where it rests: a thing beside the robot, a slide without an end.

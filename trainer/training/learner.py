@@ -225,8 +225,10 @@ class Learner:
         self.seconds = {"rollouts": collected - began, "policy": time.perf_counter() - collected}
         self.iteration += 1
         self.env_steps += rollouts.clock.size
-        figures = {"predicted": float(predicted), **asdict(stats)}
-        return rollouts, figures | ({"unstable": lost} if lost else {})
+        figures: dict[str, float] = {"predicted": float(predicted), **asdict(stats)}
+        if lost:
+            figures["unstable"] = float(lost)
+        return rollouts, figures
 
     def forecast(self, snapshot: Snapshot, ratings: Sequence[RatedSegment]) -> dict[str, float]:
         """How right a snapshot is about ratings that it was not fitted on; draws nothing at random.

@@ -143,8 +143,8 @@ def _ours_and_bare(
     low, high = np.array(robot.low), np.array(robot.high)
     actions = rng.uniform(-1, 1, (steps, lanes, robot.action_size))
     commands = (low + high) / 2 + (high - low) / 2 * actions
-    for action in np.resize(actions, (100, *actions.shape[1:])):  # spread: some fall, some fly
-        env.step(action)
+    for step in range(100):  # spread: some fall, some fly
+        env.step(actions[step % steps])
     qpos, qvel, every = env.qpos, env.qvel, np.arange(lanes)
 
     def ours() -> float:
