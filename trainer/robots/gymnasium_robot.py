@@ -40,7 +40,8 @@ def make(name: str) -> Robot:
         raise UserError(f"an environment of gymnasium is called as {PREFIX}Walker2d-v5, got {name[:80]!r}")
     env = _environment(number)
     try:
-        model, file = getattr(env.unwrapped, "model", None), getattr(env.unwrapped, "fullpath", "")
+        model: Any = getattr(env.unwrapped, "model", None)
+        file = getattr(env.unwrapped, "fullpath", "")
         skip = getattr(env.unwrapped, "frame_skip", getattr(env.unwrapped, "n_substeps", 0))
         actions = getattr(env.action_space, "shape", None)
     finally:

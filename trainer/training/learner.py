@@ -226,7 +226,9 @@ class Learner:
         self.iteration += 1
         self.env_steps += rollouts.clock.size
         figures: dict[str, float] = {"predicted": float(predicted), **asdict(stats)}
-        return rollouts, figures | ({"unstable": float(lost)} if lost else {})
+        if lost:
+            figures["unstable"] = float(lost)
+        return rollouts, figures
 
     def forecast(self, snapshot: Snapshot, ratings: Sequence[RatedSegment]) -> dict[str, float]:
         """How right a snapshot is about ratings that it was not fitted on; draws nothing at random.

@@ -167,7 +167,7 @@ class TrainingRun:
         if not self._load_checkpoint(learner):
             self._pool = learner.random_rollouts()
         self.learner, self.iteration, self.env_steps = learner, learner.iteration, learner.env_steps
-        self.unstable = sum(row.get("unstable", 0) for row in self.store.runs.iterations(self.run))
+        self.unstable = int(sum(row.get("unstable", 0) for row in self.store.runs.iterations(self.run)))
         self._load_snapshot()
         if self._drawn is not None:
             self._drawn.clips.recover(self.run)
@@ -307,7 +307,7 @@ class TrainingRun:
         self.queue.withdraw_stale(learner.iteration)
         self.iteration, self.env_steps = learner.iteration, learner.env_steps
         self.steps_per_s = stats["steps_per_s"]
-        self.unstable += stats.get("unstable", 0)
+        self.unstable += int(stats.get("unstable", 0))
         if self._watch is not None:
             self._watch(learner, snapshot)
 
