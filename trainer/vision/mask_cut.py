@@ -254,6 +254,6 @@ def _grab(frame: np.ndarray, states: np.ndarray, rounds: int) -> None:
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     with suppress(cv2.error):  # too few pixels of one kind: they stay as they are
-        cv2.grabCut(  # type: ignore[call-overload]
-            np.ascontiguousarray(frame), states, None, *models, rounds, cv2.GC_INIT_WITH_MASK
-        )
+        whole = (0, 0, 0, 0)  # not used: the states say where to begin
+        picture = np.ascontiguousarray(frame)
+        cv2.grabCut(picture, states, whole, *models, rounds, cv2.GC_INIT_WITH_MASK)
