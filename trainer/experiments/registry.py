@@ -35,6 +35,7 @@ TABLES = {
     "pose": Entry(
         "onedemo.experiments.tables.pose", "how well the pose is read from others' videos of a robot"
     ),
+    "robots": Entry("onedemo.experiments.tables.robots", "the same method on other robots"),
     "ablation": Entry("onedemo.experiments.tables.ablation", "what each part of the method contributes"),
 }
 """``onedemo bench NAME``; a new table is one module and one line here."""
