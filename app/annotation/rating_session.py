@@ -213,6 +213,7 @@ class RatingSession:
             ask = self._current
             if ask is None or clip != ask.clip or self._clock() - self._shown_at < self._guard_seconds:
                 return None
+            back = self.taken_back
             try:
                 commit(ask)
             except AlreadyAnswered:
@@ -225,7 +226,7 @@ class RatingSession:
             self._assignment.release(self._holder, clip)
             self._current = None
             try:
-                if ask.kind == "shared":
+                if ask.kind == "shared" and back is None:  # one more, and not instead of one taken back
                     self._make_up()
                 self._advance()
             except sqlite3.Error:  # the answer is kept all the same; `refill` looks again

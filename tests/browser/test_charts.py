@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from browser.test_page import DESKTOP, SMALL, opened, until
@@ -92,6 +94,7 @@ def test_a_chart_tells_values_zooms_smooths_and_marks(chromium, site):
     train(store, run, 1, 20)
     store.runs.mark(run, 20, "paused")
     store.ratings.leave_out(run, ann.id, by=ann.id)
+    time.sleep(0.01)  # times are kept to the millisecond
     train(store, run, 21, 40)
     with opened(chromium, site.links["researcher"], DESKTOP) as page:
         page.wait_for_selector(".uplot", timeout=60_000)

@@ -342,6 +342,17 @@ def type_key(page, code, key, number, modifiers=0):
     devtools.detach()
 
 
+CLICK_ONCE_IT_IS_ANOTHERS = """clip => {
+  const undo = () => document.querySelector('.od-tools [data-key="u"]');
+  new MutationObserver((_, observer) => {
+    if (!undo() || undo().dataset.undoClip === clip) return;
+    observer.disconnect();
+    undo().click();
+  }).observe(document.body, {subtree: true, childList: true, attributes: true});
+}"""
+"""Clicks "undo" a second time as soon as it would take back what was said before."""
+
+
 def test_a_double_click_on_undo_takes_back_one(chromium, site):
     with opened(chromium, site.links["annotator"]) as page:
         for _ in range(2):
@@ -350,9 +361,9 @@ def test_a_double_click_on_undo_takes_back_one(chromium, site):
         undo = page.locator('.od-tools [data-key="u"]')
         box = undo.bounding_box()
         at = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.evaluate(CLICK_ONCE_IT_IS_ANOTHERS, str(clip))  # in the page: a busy machine is late
         page.mouse.click(*at)
         until(lambda: page.wait_for_timeout(20) or undo.get_attribute("data-undo-clip") != str(clip))
-        page.mouse.click(*at)
         page.wait_for_timeout(700)
         assert [event[:2] for event in site.events()][2:] == [("undo", clip)]
         page.mouse.click(*at)  # a moment later it is meant

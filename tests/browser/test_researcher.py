@@ -165,7 +165,7 @@ def test_runs_side_by_side(chromium, site):
         to_tab(page, "Runs")
         page.wait_for_selector(".od-runs >> text=hop-1")
         cells = page.locator('tr[data-run="hop-1"]').locator("th, td").all_inner_texts()
-        assert cells[0].split("\n") == ["hop-1", "hopper-hop, paper, seed 4"]
+        assert cells[0].split("\n") == ["hop-1", "hopper learns hopper-hop, paper, seed 4"]
         assert [cell.replace("\xa0", " ") for cell in cells[1:6]] == [
             "Stopped", "0", "80 k of 10.00 M", "2.5 of 5", "500 points",
         ]  # fmt: skip

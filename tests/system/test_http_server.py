@@ -87,7 +87,7 @@ VISER = "/static/viser/viser.css"
 EXAMPLE = choose(None, DEMO_FRAMES, 9).guide[0].name
 EXAMPLES = {
     "rater": "2", "clip": "1", "pair": "1", "index": "3", "name": EXAMPLE, "iteration": "1", "suffix": "jpg",
-    "tab": "rate", "upload": "a" * 32, "demo": "b" * 64, "result": "1",
+    "tab": "rate", "upload": "a" * 32, "demo": "b" * 64, "result": "1", "end": "first",
 }  # fmt: skip
 """What the places in a route's path may be; the rater is the annotator."""
 STRANGERS_MAY = {
@@ -126,7 +126,7 @@ def test_every_route_asks_for_its_role(site, role):
         path = path.replace("/static/vendor/{package}/{name}", VENDORED)
         path = path.replace("/static/viser/{name}", VISER)
         for name, example in EXAMPLES.items():
-            path = re.sub(rf"\{{{name}(:[^/]*?(\{{\d+(,\d+)?\}})?)?\}}(?=[./]|$)", example, path)
+            path = re.sub(rf"\{{{name}(:[^/]*?(\{{\d+(,\d+)?\}})?)?\}}(?=[-./]|$)", example, path)
         if role == "researcher":
             path = path.replace("/r/2", "/r/1")
         plain = path.replace("/r/1", "/r/2")
