@@ -54,7 +54,7 @@ class OwnRater(Budget):
         super().__init__(budget, given)
         self.name = name
         self._rate = _find(name)
-        self._demo, self._dt = demo, robot_named(robot).dt
+        self._demo, self._robot = demo, robot_named(robot)
         self._frames: np.ndarray | None = None
         self._renderer: Any = None
 
@@ -97,9 +97,9 @@ class OwnRater(Budget):
         if self._renderer is None:
             self._renderer = RenderThread()
         steps = demo_step + np.arange(len(segment))
-        shown = frame_of_step(steps, self._dt, self._demo.fps, self._demo.frames)
+        shown = frame_of_step(steps, self._robot.dt, self._demo.fps, self._demo.frames)
         index, first = np.unique(shown, return_index=True)
-        agent = self._renderer.render(segment.qpos[first]).result()
+        agent = self._renderer.render(segment.qpos[first], self._robot).result()
         return np.stack([fit(frame) for frame in self._frames[index]]), agent
 
 

@@ -108,9 +108,9 @@ class RenderThread:
             self._put(order, future, job, robot or self._robot)
         return future
 
-    def render(self, qpos_Tq: np.ndarray) -> Future[np.ndarray]:
-        """The future of ``Renderer.render(qpos_Tq)``."""
-        return self.submit(lambda renderer: renderer.render(qpos_Tq))
+    def render(self, qpos_Tq: np.ndarray, robot: Robot | None = None) -> Future[np.ndarray]:
+        """The future of ``Renderer.render(qpos_Tq)``; of the thread's robot if none is given."""
+        return self.submit(lambda renderer: renderer.render(qpos_Tq), robot=robot)
 
     def close(self) -> None:
         """Ends the thread after the picture in hand; jobs still waiting are cancelled."""

@@ -11,6 +11,7 @@ import numpy as np
 from onedemo.demos.library import read_frames
 from onedemo.render.clip_image import frame_durations, side_by_side
 from onedemo.render.render_thread import RenderThread
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.types import Demo
 
 MOST_BYTES = 400_000
@@ -38,7 +39,8 @@ def movie(demo: Demo, qpos: np.ndarray) -> bytes:
     if len(qpos) != demo.frames:
         raise ValueError(f"{len(qpos)} positions do not go with the {demo.frames} frames of {demo.name}")
     with RenderThread() as drawing:
-        robot = drawing.render(np.asarray(qpos, np.float64)[::_EVERY]).result()
+        whose = robot_named(demo.robot or DEFAULT)
+        robot = drawing.render(np.asarray(qpos, np.float64)[::_EVERY], whose).result()
     pairs = [side_by_side(*pair) for pair in zip(read_frames(demo)[::_EVERY], robot, strict=True)]
     animation = cv2.Animation()
     animation.durations = frame_durations(len(pairs), demo.fps / _EVERY)

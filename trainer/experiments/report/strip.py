@@ -11,6 +11,7 @@ import numpy as np
 from onedemo.demos.library import read_frames
 from onedemo.render.clip_image import SIDE_HEIGHT, SIDE_WIDTH, fit
 from onedemo.render.render_thread import RenderThread
+from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.types import Demo
 
 _SHOWN = 8
@@ -39,7 +40,9 @@ def strip(demo: Demo, qpos: np.ndarray, *, first: float = 0.0, last: float = 1.0
         raise ValueError(f"{len(qpos)} positions do not go with the {demo.frames} frames of {demo.name}")
     shown = moments(demo.frames, first, last)
     with RenderThread() as drawing:
-        robot = drawing.render(np.asarray(qpos, np.float64)[shown]).result()
+        robot = drawing.render(
+            np.asarray(qpos, np.float64)[shown], robot_named(demo.robot or DEFAULT)
+        ).result()
     rows = [
         np.concatenate([_small(frame) for frame in row], axis=1) for row in (read_frames(demo)[shown], robot)
     ]
