@@ -81,6 +81,14 @@ def rate(page, data_dir, value, how="key"):
     return clip, value
 
 
+IN_SIGHT = """() => {
+  const canvas = document.querySelector('canvas[data-engine]').getBoundingClientRect();
+  return canvas.width > 150 && canvas.left >= 0 && canvas.right <= innerWidth + 1
+    && canvas.top >= 0 && canvas.top < innerHeight;
+}"""
+"""Whether the 3-D view is in the window: it lies outside until Watch is shown."""
+
+
 def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
     data_dir = serving.data_dir
     _, links, log = serving.start(*QUICK, *BRIEF, *options)
@@ -93,10 +101,14 @@ def rate_five_and_look(chromium, serving, tmp_path, *options, method="onedemo"):
     until(lambda: health(links["annotator"])["phase"] in ("online", "done"), 600)
     with opened(chromium, links["researcher"], TINY) as page:
         page.click('.od-tabs >> text="Watch"')
-        page.wait_for_function("() => document.querySelector('canvas[data-engine]').clientWidth > 150")
-        where = page.locator("canvas[data-engine]").bounding_box()
+        page.wait_for_function(IN_SIGHT)
         seen: set[bytes] = set()  # empty, drawn, and moving
-        until(lambda: seen.add(page.screenshot(clip=where, timeout=60_000)) or len(seen) >= 4, 600)
+
+        def look() -> None:  # where it is at that moment
+            where = page.locator("canvas[data-engine]").bounding_box()
+            seen.add(page.screenshot(clip=where, timeout=60_000))
+
+        until(lambda: look() or len(seen) >= 4, 600)
         page.click('.od-tabs >> text="Data"')
         page.wait_for_selector(f".od-data >> text=method {method}")
         with page.expect_download() as download:

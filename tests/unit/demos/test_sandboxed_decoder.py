@@ -25,7 +25,7 @@ from unit.demos.test_library import make_video, number_of, refused
 
 pytestmark = pytest.mark.seam
 
-SMALL = Limits(memory=1 << 30, cpu_seconds=5, wall_seconds=10)
+SMALL = Limits(memory=1 << 30, cpu_seconds=5, wall_seconds=60)
 
 
 @pytest.fixture
