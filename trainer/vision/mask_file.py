@@ -20,6 +20,7 @@ import numpy as np
 from onedemo.core.files import read_whole, write_atomic
 from onedemo.demos.library import stream_frames
 from onedemo.errors import UserError
+from onedemo.robots.registry import DEFAULT
 from onedemo.types import Demo
 from onedemo.vision.mask_hints import Box, Hints, check_hints
 from onedemo.vision.masks import LENGTH, METHODS, SURE, Masks, find_masks
@@ -72,8 +73,9 @@ def find_mover(
     """
     frames = looked_at(demo)
     return find_masks(
-        frames, hints=hints and hints.scaled(frames.shape[2] / demo.width), length=LENGTH, check=check
-    )
+        frames, hints=hints and hints.scaled(frames.shape[2] / demo.width), length=LENGTH, check=check,
+        robot=demo.robot or DEFAULT,
+    )  # fmt: skip
 
 
 def masks_of(demo: Demo, length: float = LENGTH) -> Masks:

@@ -20,6 +20,7 @@ import numpy as np
 from onedemo.render.mover import is_studio, solid_in_studio, way_in_studio
 from onedemo.render.renderer import studio
 from onedemo.render.stage import free_above
+from onedemo.robots.camera import Camera
 from onedemo.robots.registry import DEFAULT, robot_named
 from onedemo.vision.mask_camera import STANDS, Motion, follow_background
 from onedemo.vision.mask_cut import FOLLOWING, STILL, Colours, boxed, clicked, cut, seeds_of
@@ -97,7 +98,7 @@ METHODS = {
 
 def find_masks(
     frames: np.ndarray, *, length: float = LENGTH, hints: Hints | None = None,
-    check: Callable[[float], None] = lambda _: None,
+    check: Callable[[float], None] = lambda _: None, robot: str = DEFAULT,
 ) -> Masks:  # fmt: skip
     """Finds the mover.
 
@@ -106,10 +107,11 @@ def find_masks(
         length: Metres of the robot at its longest, of which the scale is made.
         hints: What somebody says of where it is, in pixels of these pictures.
         check: Called every now and then with the share that is done; what it raises ends the search.
+        robot: Whose studio it is, if it is this program's.
     """
     frames = np.ascontiguousarray(frames)
     if not hints and is_studio(frames):
-        return _in_studio(frames)
+        return _in_studio(frames, robot_named(robot).camera)
     greys = np.stack([cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames])
     motion = follow_background(greys)
     check(0.2)
@@ -158,9 +160,8 @@ def boxes_of(masks: np.ndarray) -> np.ndarray:
     return boxes
 
 
-def _in_studio(frames: np.ndarray) -> Masks:
+def _in_studio(frames: np.ndarray, camera: Camera) -> Masks:
     height, width = frames.shape[1:3]
-    camera = robot_named(DEFAULT).camera
     view = studio(width, height, camera)
     solids = np.stack([solid_in_studio(frame) for frame in frames])
     masks = solids.astype(bool)
@@ -168,7 +169,7 @@ def _in_studio(frames: np.ndarray) -> Masks:
     top = height - (camera.height + free_above(camera) - 0.03 - view.bottom) * view.scale
     floor[boxes_of(masks)[:, 1] < top] = np.nan  # the camera rises with the robot
     return Masks(
-        masks=masks, floor=floor, scale=view.scale, way=way_in_studio(frames, solids),
+        masks=masks, floor=floor, scale=view.scale, way=way_in_studio(frames, solids, camera),
         doubt=_doubt(masks, np.zeros(len(frames)), 1.0, "studio"), method="studio",
     )  # fmt: skip
 
