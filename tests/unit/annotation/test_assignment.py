@@ -316,6 +316,19 @@ def test_shared_clips_do_not_lead_beyond_what_was_asked_for(store, clock):
     assert all(person.current is None for person in people)
 
 
+def test_a_rating_that_is_given_again_after_undo_withdraws_no_clip(store, clock):
+    add_clips(store, 3)
+    person = make_desk(store, clock, "ann", Assignment(), wanted=lambda: 0)  # whatever waits is too much
+    person.refill()
+    for back in (True, False):
+        clip = person.current
+        clock.now += 1
+        assert person.rate(clip, 3)
+        assert len(store.clips.waiting("r")) == 2
+        clock.now += 1
+        assert not back or person.undo(clip)
+
+
 def test_a_repeated_clip_is_a_second_opinion_that_undo_takes_back(store, clock):
     add_clips(store, REPEAT_AFTER + 3)
     rng = Always("fresh")
